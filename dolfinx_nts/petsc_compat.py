@@ -6,7 +6,8 @@ import atexit
 import ctypes
 import itertools
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from mpi4py import MPI
@@ -237,3 +238,21 @@ def option_used(name: str) -> bool:
     if error := _petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used)):
         raise PETSc.Error(error)
     return bool(used.value)
+
+
+@contextmanager
+def klu_ordering() -> Iterator[None]:
+    """Let factors of KLU that are made within have an ordering for any pivots.
+
+    Rows of joints have no diagonal to pivot on: an ordering for pivots on the diagonal fills in a
+    hundred times as much. PETSc asks for it when it makes the factors alone, and without a prefix.
+    """
+    options, name = PETSc.Options(), "mat_klu_ordering"
+    if options.hasName(name):
+        yield
+        return
+    options[name] = "COLAMD"
+    try:
+        yield
+    finally:
+        options.delValue(name)

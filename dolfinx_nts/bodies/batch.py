@@ -83,8 +83,12 @@ class BodyBatch(Body):
         found = np.concatenate([np.empty(0), *(values[k] for k in self.own.tolist())])
         # A state's tuples never change, and a step asks for each many times.
         if isinstance(values, tuple):
-            self._joined.append((values, found))
+            self.remember(values, found)
         return found
+
+    def remember(self, values: tuple[FloatArray, ...], joined: FloatArray) -> None:
+        """Keep what `joined` makes of a tuple for some time: neither is to be changed."""
+        self._joined.append((values, joined))
 
     def parts(self, values: FloatArray) -> Iterator[tuple[int, FloatArray]]:
         """Number in the system and owned coordinates of each of `own`: views."""

@@ -95,7 +95,11 @@ class Batches:
                     out[k] = part
             else:
                 out[of[0]] = own
-        return tuple(out)
+        found = tuple(out)
+        for body, own in zip(self.bodies, values, strict=True):
+            if isinstance(body, BodyBatch):
+                body.remember(found, own)
+        return found
 
     def rates(self, state: State) -> tuple[list[FloatArray], list[FloatArray | None]]:
         """Velocities [m/s] of each batch and, of schemes that carry them, accelerations [m/s^2]."""

@@ -14,7 +14,7 @@ from dolfinx_nts.contact.contact_measure import Attachment, Batch, ContactMeasur
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
-from dolfinx_nts.interaction.elements import over
+from dolfinx_nts.interaction.elements import entries_of, over
 from dolfinx_nts.kernels import compiled_law, nts_element
 from dolfinx_nts.kernels.vectors import resultant
 from dolfinx_nts.parallel import gather_rows
@@ -79,6 +79,11 @@ class ContactElements(Batch):
     def pattern(self) -> BoolArray:
         """Which constraints stand in the rows of which, shape (m, m)."""
         return self.law.pattern
+
+    @property
+    def entries(self) -> BoolArray:
+        """All that `pattern` lets."""
+        return entries_of(self.num_coordinates, self.pattern)
 
     @property
     def bilateral(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,8 +79,7 @@ class Couplings:
         own: list[Coupling] = [self.contacts, *self.edges.values()]
         self._touching = sum(len(coupling.elements) for coupling in own)
         for coupling, of in self.joints:
-            history = tuple(state.joints[k] for k in of) if len(of) > 1 else state.joints[of[0]]
-            coupling.begin(step, history, again, search)
+            coupling.begin(step, itemgetter(*of)(state.joints), again, search)
 
     @property
     def elements(self) -> list[Any]:

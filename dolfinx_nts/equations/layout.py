@@ -68,8 +68,7 @@ class ElementBlocks(NamedTuple):
         columns: Columns of each part in the element's unknowns; one of a constraint with several
             multipliers occurs as often.
         numbers: Numbers in the field, shape (n, columns); negative ones are left out.
-        pattern: Which entries of an element's tangent can be non-zero, shape (r, r); all of those
-            that couple coordinates of bodies with anything.
+        pattern: Which entries of an element's tangent can be non-zero, shape (r, r).
         weights: Of the multipliers, the last part, in the constraints, shape (n, columns); None:
             they are one.
     """

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.batches import Batches
@@ -39,7 +42,11 @@ class Lengths:
         self.motion, self.extent, self.moved = np.zeros((3, len(system.bodies)))
         self.fall = 0.0
         links = (*system.contact_bodies, *system.joint_bodies)
-        self._linked = [list(bodies) for bodies in links if len(bodies) > 1]
+        ends = np.array([two for of in links for two in pairwise(of)], dtype=np.int64)
+        a, b = ends.reshape(-1, 2).T
+        graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(len(system.bodies),) * 2)
+        #: Of each body that of all that contacts and joints link to it.
+        self._groups, self._group = connected_components(graph, directed=False)
 
     def begin(
         self,
@@ -73,14 +80,10 @@ class Lengths:
             fall: What a body at rest may fall [m].
         """
         self.fall = fall
-        length: FloatArray = self.moved + self.motion + fall
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
-        linked = length.tolist()  # numbers one by one are faster outside of NumPy
-        for bodies in self._linked:
-            longest = max(linked[k] for k in bodies)
-            for k in bodies:
-                linked[k] = longest
-        return np.array(linked)
+        longest = np.zeros(self._groups)
+        np.maximum.at(longest, self._group, self.moved + self.motion + fall)
+        return longest[self._group]
 
     @property
     def farthest(self) -> float:

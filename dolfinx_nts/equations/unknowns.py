@@ -115,14 +115,16 @@ class Unknowns:
             stops = np.cumsum([0, *(n.shape[1] for n in numbers)])
             pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
             columns, weights = [np.arange(a, b) for a, b in pairwise(stops)], None
+            both = np.arange(stops[len(of_bodies)])
             if "constraints" in self.own:
-                pattern[stops[-2] :, stops[-2] :] = c.pattern
+                both = np.concatenate([both, columns[-1]])
                 if c.combination is not None:
                     number, weight, _ = c.combination
                     columns[-1] = columns[-1].repeat(weight.shape[2])
                     weights = weight.reshape(len(weight), len(columns[-1]))
                     new = offset["constraints"] + number.reshape(weights.shape)
                     numbers[-1] = np.where(weights == 0.0, -1, new)
+            pattern[np.ix_(both, both)] = c.entries[: len(both), : len(both)]
             for name in self.own:
                 offset[name] += _size(c, name)
             fields = (*(field for field, _ in of_bodies), *self.own.values())

@@ -111,6 +111,7 @@ class ConstraintElements(PointElements):
         extents: As of `extents_of` [m], shape (n,).
         names: Of the joints that they are of.
         joint: Number of each element's joint among these, shape (n,).
+        moves: Whether coefficients depend on time.
     """
 
     equations: Equations
@@ -124,6 +125,7 @@ class ConstraintElements(PointElements):
     extents: FloatArray
     names: Sequence[str]
     joint: IntArray
+    moves: bool
 
     @property
     def widths(self) -> Mapping[str, int]:
@@ -143,6 +145,16 @@ class ConstraintElements(PointElements):
     def pattern(self) -> BoolArray:
         """Which constraints stand in the rows of which: each in its own."""
         return np.eye(self.widths["constraints"], dtype=bool)
+
+    @property
+    def entries(self) -> BoolArray:
+        """Those that coefficients which do not change with time let."""
+        if self.moves:
+            return super().entries
+        entries = kernel.pattern(*self.equations[:2])
+        first = self.num_coordinates
+        entries[first:, first:] = self.pattern
+        return entries
 
     @cached_property
     def extent(self) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -79,6 +81,8 @@ class Constraints(EveryStep):
         self._touched = set(bodies)
         self._members: Sequence[Constraints] = (self,)
         self._all, self._resting = rows, frozenset[int]()
+        #: Multipliers of the last accepted step, of all and of each joint.
+        self._told: tuple[FloatArray, list[FloatArray]] = rows.force, []
         self._take(rows)
         self._scaled = False
         # What is prescribed may move its bodies in any step.
@@ -125,8 +129,20 @@ class Constraints(EveryStep):
         if self._resting:
             self._resting = frozenset()
             self._take(self._all)
-        # A guess alone: a run may go on from one whose joint of this name had other equations.
         given = history if len(self._names) > 1 else (history,)
+        force, told = self._told
+        if not (told and all(map(is_, given, told))):
+            force = self._known(given)
+        self._scale(step)
+        self._all = self._rows = replace(self._all, force=force)
+        self.bodies = [self._of]
+        super().begin(step, history, again, search)
+
+    def _known(self, given: Sequence[Any]) -> FloatArray:
+        """Multipliers from those of each joint: a guess alone.
+
+        A run may go on from one whose joint of this name had other equations.
+        """
         start, known = 0, self._all.force.copy()
         counts = np.bincount(self._all.joint, minlength=len(self._names)).tolist()
         for own, count in zip(given, counts, strict=True):
@@ -134,10 +150,7 @@ class Constraints(EveryStep):
             if own is not None and own.shape == here.shape:
                 here[:] = own
             start += count
-        self._scale(step)
-        self._all = self._rows = replace(self._all, force=known)
-        self.bodies = [self._of]
-        super().begin(step, history, again, search)
+        return known
 
     def _scale(self, step: Step) -> None:
         """Ask for the scales of the elements, in dynamics once. Collective."""
@@ -186,10 +199,10 @@ class Constraints(EveryStep):
             (part,) = parts
             force = force.copy()
             force[~self._rest_of_rows()] = part.multiplier / self._factor
-        if len(self._names) == 1:
-            return force
         ends = np.searchsorted(self._all.joint, np.arange(len(self._names) + 1)).tolist()
-        return [force[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+        each = [force[a:b] for a, b in pairwise(ends)]
+        self._told = force, each
+        return each if len(each) > 1 else each[0]
 
     def hold_alone(self) -> None:
         """They repeat no others: nothing is lent to them, which light bodies would feel."""
@@ -213,6 +226,7 @@ class Constraints(EveryStep):
             extents=extents_of(equations, self._rest) if driven else self._extents,
             names=self._names,
             joint=rows.joint,
+            moves=self._driven is not None,
         )
 
     def _nodal(self, values: Sequence[FloatArray]) -> FloatArray:

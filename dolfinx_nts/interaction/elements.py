@@ -130,6 +130,14 @@ class Elements(Protocol):
         """Which constraints stand in the rows of which, shape (m, m)."""
 
     @property
+    def entries(self) -> BoolArray:
+        """Which entries of a tangent can be non-zero, those of augmented unknowns left out.
+
+        Those that are not never are while the layout of a step's unknowns lasts; shape
+        (k + m, k + m), of k coordinates and m constraints.
+        """
+
+    @property
     def combination(self) -> Combination | None:
         """How unknowns of its constraints follow from multipliers; None: each has its own."""
 
@@ -216,6 +224,13 @@ class Elements(Protocol):
             part: Last iterate.
             flips: How often `Part.status` changed, shape (states, n).
         """
+
+
+def entries_of(num_coordinates: int, pattern: BoolArray) -> BoolArray:
+    """`Elements.entries` of elements in which all coordinates stand in all rows."""
+    entries = np.ones((num_coordinates + len(pattern),) * 2, dtype=bool)
+    entries[num_coordinates:, num_coordinates:] = pattern
+    return entries
 
 
 def evaluate_together(

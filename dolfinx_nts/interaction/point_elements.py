@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinx_nts.interaction.combination import Combination, num_multipliers, of_multipliers
 from dolfinx_nts.interaction.coupling import StepWarning
-from dolfinx_nts.interaction.elements import Step, over
+from dolfinx_nts.interaction.elements import Step, entries_of, over
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import Kinematics, differenced, has_constraints, unknown
 from dolfinx_nts.interaction.points import Points
@@ -57,6 +57,11 @@ class PointElements:
     def pattern(self) -> BoolArray:
         """Which constraints stand in the rows of which: all."""
         return np.ones((self.widths["constraints"],) * 2, dtype=bool)
+
+    @property
+    def entries(self) -> BoolArray:
+        """All that `pattern` lets."""
+        return entries_of(self.num_coordinates, self.pattern)
 
     @property
     def bilateral(self) -> bool:

@@ -3,7 +3,7 @@
 Each is a product v . w of two vectors that are linear in the nodal vectors, v = V_a y_a + v_0. They
 are formed before they are multiplied: a difference of points far from the origin keeps its digits.
 
-V = 1/2 (p - p_ref)^T H (p - p_ref) with products p, see `quadratic`, and H = sum S^T C S of strains
+V = 1/2 (p - p_ref)^T H (p - p_ref) with products p, and H = sum S^T C S of strains
 e = S (p - p_ref): 1/2 e^T C e of all points. D p(y_m)(y_1 - y_0) = p_1 - p_0 exactly, so that the
 discrete gradient of V needs no quotient.
 """
@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.kernels import quadratic
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 def factors(weights: FloatArray, constants: FloatArray, y: FloatArray) -> FloatArray:
@@ -51,6 +50,26 @@ def curvature(weights: FloatArray) -> FloatArray:
     return one_way + one_way.transpose(0, 1, 3, 2)
 
 
+def pattern(weights: FloatArray, constants: FloatArray) -> BoolArray:
+    """What can be non-zero in the second derivatives of sum lambda_i g_i by y and lambda.
+
+    Args:
+        weights: As of `factors`.
+        constants: Likewise.
+
+    Returns:
+        Of all elements together, rows and columns of y, then of lambda, shape (3 k + m, 3 k + m).
+    """
+    m, k, taken = weights.shape[1], weights.shape[3], weights != 0.0
+    # A factor without weights is a constant, which may have few components.
+    other = (taken.any(axis=3)[..., None] | (constants != 0.0))[:, :, ::-1]
+    gradients = (taken[..., None] & other[:, :, :, None]).any(axis=(0, 2)).reshape(m, 3 * k)
+    bends = (curvature(weights) != 0.0).any(axis=(0, 1))
+    corner = np.kron(bends, np.eye(3, dtype=bool))
+    return np.block([[corner, gradients.T], [gradients, np.zeros((m, m), dtype=bool)]])
+
+
+
 class Elements(NamedTuple):
     """Elements that are free of stress in the reference; axis 0 = element.
 
@@ -67,21 +86,21 @@ class Elements(NamedTuple):
 
 def elements(weights: FloatArray, hessian: FloatArray, y: FloatArray) -> Elements:
     """Elements with nodal vectors y (n, k, 3) in the reference [m]."""
-    return Elements(weights, quadratic.value(_factors(weights, y)), hessian)
+    return Elements(weights, value(_factors(weights, y)), hessian)
 
 
 def changes(of: Elements, y: FloatArray) -> FloatArray:
     """Products less those of the reference, shape (n, m)."""
-    return quadratic.value(_factors(of.weights, y)) - of.rest
+    return value(_factors(of.weights, y)) - of.rest
 
 
 def _factors(weights: FloatArray, y: FloatArray) -> FloatArray:
-    return quadratic.factors(weights, np.zeros((*weights.shape[:3], 3)), y)
+    return factors(weights, np.zeros((*weights.shape[:3], 3)), y)
 
 
 def _gradient(of: Elements, y: FloatArray) -> FloatArray:
     """Derivative of the products by the nodal vectors, shape (n, m, 3 k)."""
-    found = quadratic.gradient(of.weights, _factors(of.weights, y))
+    found = gradient(of.weights, _factors(of.weights, y))
     return found.reshape(*found.shape[:2], 3 * found.shape[2])
 
 

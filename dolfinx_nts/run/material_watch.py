@@ -6,6 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
 
@@ -19,10 +20,12 @@ class MaterialWatch:
 
     def __init__(self, system: System) -> None:
         self._comm = system.comm
-        self._bodies = system.bodies
-        self._known = self._values()
-        for body in self._bodies:
+        for body in system.bodies:
             body.take_parameters()
+        sizes = np.array([float(body.parameters().size) for body in system.bodies])
+        have = global_max(self._comm, sizes)
+        self._bodies = [body for body, size in zip(system.bodies, have, strict=True) if size]
+        self._known = self._values()
 
     def _values(self) -> list[FloatArray]:
         return [body.parameters() for body in self._bodies]
@@ -32,9 +35,11 @@ class MaterialWatch:
 
         Those bodies take them over. Collective.
         """
+        if not self._bodies:
+            return []
         now = self._values()
         both = zip(self._known, now, strict=True)
-        differ = [bool(a.size or b.size) and not np.array_equal(a, b) for a, b in both]
+        differ = [not np.array_equal(a, b) for a, b in both]
         flags = np.array(differ, dtype=bool)
         self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
         bodies = [body for body, flag in zip(self._bodies, flags, strict=True) if flag]

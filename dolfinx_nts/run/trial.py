@@ -70,7 +70,6 @@ def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
 def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
     """State at t_{n+1}. Collective."""
     old, dt, batches = problem.state, problem.dt, problem.batches
-    u, v, a = (list(values) for values in (old.u, old.v, old.a))
     ends = [
         problem.supports.advance(of[0], terms.du, v0, a0)
         for of, terms, v0, a0 in zip(batches.numbers, step.terms, *batches.rates(old), strict=True)
@@ -80,17 +79,24 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
             # What has no momentum has no velocity of its own either.
             v1[body.massless] = terms.du[body.massless] / dt
     places = [terms.u1.copy() for terms in step.terms]
-    both = (u, places), (v, [v1 for v1, _ in ends])
-    moves = _moves(problem, places, both[1][1])
-    for (now, found), moved in zip(both, moves, strict=True):
-        after = batches.split(found)
-        for k in np.flatnonzero(moved).tolist():
-            now[k] = after[k]
+    speeds = [v1 for v1, _ in ends]
+    moved, sped = _moves(problem, places, speeds)
+    u = _renewed(old.u, batches.split(places), moved)
+    v, a = _renewed(old.v, batches.split(speeds), sped), old.a
     if a:
-        after = batches.split([a1 for _, a1 in ends if a1 is not None])
-        for k in problem.awake:
-            a[k] = after[k]
-    return State(time, tuple(u), tuple(v), tuple(a), *problem.couplings.history(step))
+        awake = np.isin(np.arange(batches.count), problem.awake)
+        a = _renewed(a, batches.split([a1 for _, a1 in ends if a1 is not None]), awake)
+    return State(time, u, v, a, *problem.couplings.history(step))
+
+
+def _renewed(
+    old: tuple[FloatArray, ...], new: tuple[FloatArray, ...], chosen: Any
+) -> tuple[FloatArray, ...]:
+    """Values of bodies, new ones of those chosen, (bodies,)."""
+    if chosen.all():
+        return new
+    both = zip(old, new, chosen.tolist(), strict=True)
+    return tuple(after if renew else before for before, after, renew in both)
 
 
 def _moves(problem: StepProblem, *ends: Sequence[FloatArray]) -> FloatArray:
@@ -102,8 +108,8 @@ def _moves(problem: StepProblem, *ends: Sequence[FloatArray]) -> FloatArray:
     for row, before, now in zip(out, (problem.state.u, problem.state.v), ends, strict=True):
         both = zip(batches.join(before), now, strict=True)
         row[:] = batches.largest([(a != b).astype(float) for a, b in both])
-    out[:, [k for k in range(batches.count) if k not in set(problem.awake)]] = 0.0
-    return global_max(batches.comm, out)
+    awake = np.isin(np.arange(batches.count), problem.awake)
+    return global_max(batches.comm, out * awake)
 
 
 class LastSteps:

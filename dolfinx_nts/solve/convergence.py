@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
-from dolfinx_nts.interaction.elements import over
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max, global_sum
 from dolfinx_nts.types import FloatArray
@@ -17,17 +16,28 @@ from dolfinx_nts.types import FloatArray
 _CANCELLED = 32 * float(np.finfo(float).eps)
 
 
+def worst(problem: StepProblem, e: Evaluation) -> float:
+    """The largest of `ratios`. Collective."""
+    of_bodies, of_elements = _over_limits(problem, e), _of_elements(problem, e)
+    found = np.array([of_bodies.max(), *(max(one.values()) for one in of_elements if one)])
+    if of_elements:
+        found = global_max(problem.system.comm, found.max(keepdims=True))
+    return float(found[0])
+
+
 def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     """Residual of each block over what counts as converged there; solved when all are <= 1.
 
     Collective.
     """
-    residuals = [terms.residual for terms in e.terms]
-    of_bodies = _over_limits(problem, e, residuals, problem.rounding.forces)
-    ratio = dict(zip((b.name for b in problem.system.bodies), of_bodies, strict=True))
-    if problem.laid.own:
-        ratio |= _of_elements(problem, e)
-    return ratio
+    names = [body.name for body in problem.system.bodies]
+    ratio = dict(zip(names, _over_limits(problem, e).tolist(), strict=True))
+    for found in _of_elements(problem, e):
+        # Several contacts of two bodies have one name.
+        for name, value in found.items():
+            ratio[name] = max(value, ratio.get(name, 0.0))
+    largest = global_max(problem.system.comm, np.array(list(ratio.values())))
+    return dict(zip(ratio, largest.tolist(), strict=True))
 
 
 def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
@@ -39,7 +49,7 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
     held = [problem.stabilization.of(body) * terms.du for body, terms in both]
     found = _over_limits(problem, e, held, problem.rounding.at(problem.lengths.displacement_of(e)))
     k = int(np.argmax(found))
-    return found[k], problem.system.bodies[k].name
+    return float(found[k]), problem.system.bodies[k].name
 
 
 def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
@@ -62,25 +72,30 @@ def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
 
 
 def _over_limits(
-    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
-) -> list[float]:
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray] | None = None,
+    rounding: FloatArray | None = None,
+) -> FloatArray:  # fmt: skip
     """A force on each batch over that which counts as zero, by body; asleep 0. Collective.
+
+    The force is the residual unless another is given, with its rounding.
 
     It is measured by the largest of its inertial, internal, external and coupling forces. Of
     elements' forces that cancel each other, as on a body without mass of note between two springs,
     only the rounding counts, so that strong joints loosen no tolerance.
     """
+    if forces is None or rounding is None:
+        forces, rounding = [terms.residual for terms in e.terms], problem.rounding.forces
     batches, parts = problem.batches, _forces_on(problem, e, forces)
     squares = np.empty((6, batches.count))
     squares[:5] = batches.sums([np.square(own) for own in parts])
     squares[5] = problem.laid.gross_forces(problem.elements, e.parts, batches.count)
     norms = np.sqrt(global_sum(batches.comm, squares))
     limits = problem.rtol * norms[1:5].max(axis=0) + _CANCELLED * norms[5] + rounding
-    limits = limits.tolist()
-    found, sizes = [0.0] * batches.count, norms[0].tolist()
-    for k in problem.awake:
-        found[k] = over(sizes[k], limits[k])
-    return found
+    found = np.zeros(batches.count)
+    awake = np.isin(np.arange(batches.count), problem.awake)
+    with np.errstate(divide="ignore", over="ignore"):
+        np.divide(norms[0], limits, out=found, where=awake & (norms[0] != 0.0))
+    return np.where(np.isnan(found), np.inf, found)
 
 
 def _forces_on(
@@ -96,8 +111,10 @@ def _forces_on(
     return found
 
 
-def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
-    """`ratios` of the elements' own unknowns."""
+def _of_elements(problem: StepProblem, e: Evaluation) -> list[dict[str, float]]:
+    """`ratios` of each batch of elements on this rank, for their own unknowns. Collective."""
+    if not problem.laid.own:
+        return []
     moved = max(float(np.abs(terms.du).max(initial=0.0)) for terms in e.terms)
     comm, linked, elements = problem.system.comm, problem.couplings.linked, problem.elements
     # MPI's maximum may swallow a NaN, so it travels as a flag.
@@ -112,13 +129,11 @@ def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     motion = max(top[0], problem.lengths.farthest)
     rounded = motion + float(problem.lengths.moved.max())
     extents = top[len(local) :]
-    sizes, ratio = top[2 : len(local)].reshape(-1, 4), dict[str, float]()
+    sizes, found = top[2 : len(local)].reshape(-1, 4), []
     for c, part, largest, of in zip(elements, e.parts, sizes, linked, strict=True):
         # What rounding leaves open in a joint the linear solve passes on to all that its bodies
         # link.
         given = largest if of is None else [*largest[:3], extents[of]]
-        # Several contacts of two bodies have one name.
-        for name, value in c.ratios(part, given, motion, rounded, problem.rtol).items():
-            ratio[name] = max(value, ratio.get(name, 0.0))
-    found = np.array(list(ratio.values())) if not top[1] else np.full(len(ratio), np.inf)
-    return dict(zip(ratio, global_max(comm, found).tolist(), strict=True))
+        ratio = c.ratios(part, given, motion, rounded, problem.rtol)
+        found.append(ratio if not top[1] else dict.fromkeys(ratio, np.inf))
+    return found

@@ -23,6 +23,7 @@ class InversionGuard:
     def __init__(self, problem: StepProblem) -> None:
         self._problem = problem
         self._known: dict[int, tuple[FloatArray, float]] = {}
+        self._deform = not all(body.rigid for body in problem.system.bodies)
         self._careful, self._shortened = False, 0
 
     def begin(self, *, careful: bool) -> None:
@@ -41,11 +42,13 @@ class InversionGuard:
 
     def smallest(self, x: FloatArray) -> FloatArray:
         """Smallest det F of each body at an iterate, shape (bodies,). Collective."""
+        if not self._deform:
+            return np.full(len(self._problem.system.bodies), np.inf)
         return smallest_dets(self._problem.system, self._displacements(x), self._known)
 
     def accepts(self, dets: FloatArray) -> bool:
         """Whether no body with these smallest det F is inside out that must not be."""
-        return bool((forbidden(self._problem.system, dets) > 0.0).all())
+        return not self._deform or bool((forbidden(self._problem.system, dets) > 0.0).all())
 
     def shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Scale an update y that SNES subtracts from x; tells whether it did. Collective."""

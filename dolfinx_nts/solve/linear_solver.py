@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import weakref
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any
 
 from mpi4py import MPI
@@ -295,8 +296,14 @@ class SolverOptions:
         for name, source in options.items():
             database[prefix + name] = self._all[source]
             self._entered[prefix + name] = source
+        klu = self._all.get("pc_factor_mat_solver_type") == "klu"
         try:
-            snes.setFromOptions()
+            with petsc_compat.klu_ordering() if klu else nullcontext():
+                snes.setFromOptions()
+                if klu:
+                    ksp, (matrix, source, _) = snes.getKSP(), snes.getJacobian()
+                    ksp.setOperators(matrix, source)
+                    ksp.getPC().setFactorSetUpSolverType()
         except PETSc.Error as error:
             raise self._refused(error) from error
 

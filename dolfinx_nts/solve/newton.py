@@ -17,7 +17,7 @@ from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.solve.accuracy import EXACT, Newton
-from dolfinx_nts.solve.convergence import leaves_work, ratios
+from dolfinx_nts.solve.convergence import leaves_work, worst
 from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
 from dolfinx_nts.solve.inversion_guard import InversionGuard
 from dolfinx_nts.solve.iterates import Iterates
@@ -273,9 +273,9 @@ class StepSolver:
 
     def _worst(self, e: Evaluation) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            worst = max(ratios(self.problem, e).values())
+            found = worst(self.problem, e)
         # What contacts satisfy that are held as they are not is no solution.
-        return max(worst, 2.0) if e is self.iterates.last and self.iterates.imposed else worst
+        return max(found, 2.0) if e is self.iterates.last and self.iterates.imposed else found
 
     def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
         last = self.iterates.last

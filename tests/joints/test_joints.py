@@ -168,6 +168,28 @@ def test_tangent_against_differences(kind):
         steps = 1e-3 * np.eye(z.shape[1])
         found = np.stack([(residual(z + d) - residual(z - d)) / 2e-3 for d in steps], axis=2)
         assert np.abs(found - tangent).max() < 1e-11 * np.abs(tangent).max()
+        assert not tangent[:, ~batch.entries].any()
+    stepper.close()
+
+
+@pytest.mark.parametrize("angle", [None, lambda t: 100.0 * t**2])
+def test_entries_that_are_zero_at_the_start_may_not_stay_so(angle):
+    """A hinge along z at rest in the axes of the frame, which then turns by a radian."""
+    wheel = nts.RigidBody.from_inertia(2.0, (0.1, 0.2, 0.3), (1.0, 0.0, 0.0), name="wheel")
+    hinge = nts.Revolute(wheel, None, point=(0, 0, 0), axis=(0, 0, 1), angle=angle)
+    system = nts.System([wheel], joints=[hinge], gravity=(0.0, -400.0, 0.0))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    free = []
+    for _ in range(5):
+        stepper.advance(2e-2)
+        for batch in stepper.problem.elements:
+            y = batch.reference() + np.random.default_rng(5).standard_normal((1, 4, 3))
+            own = {"constraints": np.ones((1, batch.widths["constraints"]))}
+            tangent = batch.evaluate(y, own).tangent
+            assert not tangent[:, ~batch.entries].any()
+            free.append((~batch.entries).mean())
+    # About half of the entries can never be anything, unless the hinge is driven.
+    assert max(free) > 0.4
     stepper.close()
 
 
