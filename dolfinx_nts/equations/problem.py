@@ -60,6 +60,7 @@ class StepProblem:
         stabilization: In statics, what holds each node at t_n.
         lengths: Lengths of the scene, and of the step after `begin`.
         loads: When the step takes which loads.
+        is_awake: Whether each body is one of them, shape (bodies,).
         sleepers: Bodies that the step leaves out.
         supports: Prescribed coordinates in the step.
         batches: Which bodies it evaluates together.
@@ -77,6 +78,7 @@ class StepProblem:
         # What batches contribute that have no element on any rank: nothing, at every iterate.
         self._of_none: tuple[Any, ...] | None = None
         self.awake: tuple[int, ...] = ()
+        self.is_awake = np.zeros(self.batches.count, dtype=bool)
         self._numbers: tuple[Any, ...] | None = None
         self.couplings = Couplings(system)
         self._shared = SharedWeight(system.comm, system.contacts)
@@ -182,6 +184,8 @@ class StepProblem:
         """
         system = self.system
         self.awake = self.sleepers.awake()
+        self.is_awake[:] = False
+        self.is_awake[list(self.awake)] = True
         elements = self.elements
         widths = np.array([list(c.widths.values()) for c in elements])
         combined = [a for c in elements if c.combination is not None for a in c.combination]

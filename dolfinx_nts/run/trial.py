@@ -84,8 +84,8 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
     u = _renewed(old.u, batches.split(places), moved)
     v, a = _renewed(old.v, batches.split(speeds), sped), old.a
     if a:
-        awake = np.isin(np.arange(batches.count), problem.awake)
-        a = _renewed(a, batches.split([a1 for _, a1 in ends if a1 is not None]), awake)
+        found = batches.split([a1 for _, a1 in ends if a1 is not None])
+        a = _renewed(a, found, problem.is_awake)
     return State(time, u, v, a, *problem.couplings.history(step))
 
 
@@ -108,8 +108,7 @@ def _moves(problem: StepProblem, *ends: Sequence[FloatArray]) -> FloatArray:
     for row, before, now in zip(out, (problem.state.u, problem.state.v), ends, strict=True):
         both = zip(batches.join(before), now, strict=True)
         row[:] = batches.largest([(a != b).astype(float) for a, b in both])
-    awake = np.isin(np.arange(batches.count), problem.awake)
-    return global_max(batches.comm, out * awake)
+    return global_max(batches.comm, out * problem.is_awake)
 
 
 class LastSteps:

@@ -92,9 +92,8 @@ def _over_limits(
     norms = np.sqrt(global_sum(batches.comm, squares))
     limits = problem.rtol * norms[1:5].max(axis=0) + _CANCELLED * norms[5] + rounding
     found = np.zeros(batches.count)
-    awake = np.isin(np.arange(batches.count), problem.awake)
     with np.errstate(divide="ignore", over="ignore"):
-        np.divide(norms[0], limits, out=found, where=awake & (norms[0] != 0.0))
+        np.divide(norms[0], limits, out=found, where=problem.is_awake & (norms[0] != 0.0))
     return np.where(np.isnan(found), np.inf, found)
 
 
