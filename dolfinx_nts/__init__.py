@@ -57,6 +57,7 @@ from dolfinx_nts.joints import (
     Tie,
     Universal,
 )
+from dolfinx_nts.joints.actuators import Thrust, Torque
 from dolfinx_nts.joints.forces import AboutAxis, BetweenPoints
 from dolfinx_nts.joints.laws import JointFriction
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
@@ -158,7 +159,9 @@ __all__ = [
     "Surface",
     "SurfacePair",
     "System",
+    "Thrust",
     "Tie",
+    "Torque",
     "TorsionDamper",
     "TorsionSpring",
     "Traction",

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.joints import laws
 from dolfinx_nts.joints.between import ROUNDED, Between, Product, Times, Vector, triad
-from dolfinx_nts.joints.laws import JointFriction, Motor, laws_on
+from dolfinx_nts.joints.laws import JointFriction, Motor
 from dolfinx_nts.types import Places
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -40,6 +41,8 @@ class Spherical(Between):
         b: A body, or None.
         point: Of both at the start [m].
         displacement: Function of time whose change since t = 0 p_A - p_B [m] follows.
+        cone: A direction at the start, of any length, and the largest angle [rad] between it in A
+            and in B; None: none. Asks for bodies with directions, as those of `Revolute`.
         name: In messages and files; default: kind and bodies.
 
     Raises:
@@ -54,11 +57,13 @@ class Spherical(Between):
         *,
         point: Places,
         displacement: Callable[[float], Any] | None = None,
+        cone: Any = None,
         name: str | None = None,
     ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         if displacement is not None:
             self.drive("displacement", displacement, "m", at_time)
+        self.parts = laws.cone(self, cone)
 
     def products(self, times: Times) -> Iterator[Product]:
         """p_A - p_B = c."""
@@ -148,7 +153,7 @@ class Revolute(_WithAxis):
         super().__init__(a, b, point=point, axis=axis, name=name)
         if angle is not None:
             self.drive("angle", angle, "rad", number_at)
-        self.parts = laws_on(self, friction, limits, motor, turns=True)
+        self.parts = laws.laws_on(self, friction, limits, motor, turns=True)
 
     def products(self, times: Times) -> Iterator[Product]:
         """Spherical, parallel axes, and the angle.
@@ -182,7 +187,48 @@ class Revolute(_WithAxis):
 
 @known_options
 class Cylindrical(_WithAxis):
-    """B slides along A's axis and turns about it."""
+    """B slides along A's axis and turns about it.
+
+    Args:
+        a: A rigid body, a beam or shell, which it takes at the node there, or None.
+        b: Likewise.
+        point: On the axis at the start [m].
+        axis: n at the start, of any length.
+        sliding_friction: As `friction` of `Prismatic`.
+        sliding_limits: As `limits` of `Prismatic`.
+        sliding_motor: As `motor` of `Prismatic`.
+        turning_friction: As `friction` of `Revolute`.
+        turning_limits: As `limits` of `Revolute`.
+        turning_motor: As `motor` of `Revolute`.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
+    """
+
+    def __init__(
+        self,
+        a: Body | None,
+        b: Body | None,
+        *,
+        point: Places,
+        axis: Places,
+        sliding_friction: JointFriction | None = None,
+        sliding_limits: Any = None,
+        sliding_motor: Motor | None = None,
+        turning_friction: JointFriction | None = None,
+        turning_limits: Any = None,
+        turning_motor: Motor | None = None,
+        name: str | None = None,
+    ) -> None:
+        super().__init__(a, b, point=point, axis=axis, name=name)
+        sliding = sliding_friction, sliding_limits, sliding_motor
+        turning = turning_friction, turning_limits, turning_motor
+        self.parts = (
+            *laws.laws_on(self, *sliding, turns=False, word="sliding_"),
+            *laws.laws_on(self, *turning, turns=True, word="turning_"),
+        )
 
     def products(self, times: Times) -> Iterator[Product]:
         """Point on the axis, parallel axes."""
@@ -227,7 +273,7 @@ class Prismatic(_WithAxis):
         super().__init__(a, b, point=point, axis=axis, name=name)
         if displacement is not None:
             self.drive("displacement", displacement, "m", number_at)
-        self.parts = laws_on(self, friction, limits, motor, turns=False)
+        self.parts = laws.laws_on(self, friction, limits, motor, turns=False)
 
     def products(self, times: Times) -> Iterator[Product]:
         """Cylindrical, m1_A . m2_B = 0, and n_A . (p_A - p_B) = c where it is prescribed."""

@@ -5,7 +5,7 @@ A joint knows none of them. Each is a joint of its own beside it, with its own c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import (
     call_together,
+    direction,
     is_finite,
     known_options,
     require_positive,
@@ -126,35 +127,29 @@ class Driven:
 
 
 class OnJoint(AlongMeasure):
-    """A law on the angle by which A turns relative to B about a joint's axis, or on its way along.
+    """A law on a measure of a joint.
 
     Args:
-        joint: A joint with an axis.
+        joint: The joint.
         word: What it is, for its name.
-        law: The law, from what makes a length of the measure [m].
+        law: The law.
         entry: As of `AlongMeasure`.
-        turns: Whether on the angle.
+        kind: Of the measure.
+        vectors: That it is of, of the joint.
+        length: What makes a length of it [m].
     """
 
     def __init__(
-        self,
-        joint: Any,
-        word: str,
-        law: Callable[[float], Any],
-        entry: tuple[str, float],
-        *,
-        turns: bool,
-    ) -> None:
+        self, joint: Any, word: str, law: Any, entry: tuple[str, float],
+        kind: Any, vectors: Iterable[Any], length: float,
+    ) -> None:  # fmt: skip
         super().__init__(joint.ends, f"{joint.name} {word}")
-        kind: Any = kernel.Angle if turns else kernel.Along
-        angle, way = (joint.m1_b, joint.m2_b, joint.m1_a), (joint.n_a, joint.p_a - joint.p_b)
-        rows = [(v.weights, v.constant) for v in (angle if turns else way)]
-        self._lay(kind, joint.sides, rows, joint.length if turns else 1.0)
-        self.law, self.entry = law(self.measure.length), entry
+        self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
+        self.law, self.entry = law, entry
 
 
 def laws_on(
-    joint: Any, friction: Any, limits: Any, motor: Motor | None, *, turns: bool
+    joint: Any, friction: Any, limits: Any, motor: Motor | None, *, turns: bool, word: str = ""
 ) -> tuple[OnJoint, ...]:
     """Friction, limits and motor of a joint, those that are given. Collective.
 
@@ -163,45 +158,99 @@ def laws_on(
         friction: `JointFriction`, or None.
         limits: Smallest and largest angle [rad] or way [m] from the start, or None.
         motor: Torque [N m] or force [N] on A of time, angle or way, and rate, or None.
-        turns: Whether they act on the angle; else on the way along the axis.
+        turns: Whether they act on the angle by which A turns relative to B about the axis; else on
+            its way along.
+        word: What the arguments' names begin with.
 
     Raises:
         TypeError: An argument is of another kind.
         ValueError: limits are not two numbers around 0 in this order.
     """
-    require_same(joint.comm, friction=friction, limits=limits)
-    found: list[tuple[str, Callable[[float], Any], tuple[str, float]]] = []
+    given = {f"{word}friction": friction, f"{word}limits": limits}
+    require_same(joint.comm, **given)
+    names = [*given, f"{word}motor"]
+    measure: tuple[Any, Any, float] = (
+        (kernel.Angle, (joint.m1_b, joint.m2_b, joint.m1_a), joint.length)
+        if turns else (kernel.Along, (joint.n_a, joint.p_a - joint.p_b), 1.0)
+    )  # fmt: skip
+    found: list[tuple[str, Any, tuple[str, float]]] = []
     if friction is not None:
         if not isinstance(friction, JointFriction):
-            raise TypeError(f"friction={friction!r}: pass nts.JointFriction(bound=...)")
-        bound = Bound(float(friction.bound))
-        found.append(("friction", lambda _: bound, ("friction_dissipation", 1.0)))
+            raise TypeError(f"{names[0]}={friction!r}: pass nts.JointFriction(bound=...)")
+        found.append((names[0], Bound(float(friction.bound)), ("friction_dissipation", 1.0)))
     if limits is not None:
-        both = np.array(_both(limits))
-        found.append(("limits", lambda length: Limits(*length * both), ("contact_defect", 1.0)))
+        both = measure[2] * np.array(_both(names[1], limits))
+        found.append((names[1], Limits(*both.tolist()), ("contact_defect", 1.0)))
     if motor is not None:
-        if not callable(motor):
-            raise TypeError(f"motor={motor!r}: pass a function of time, angle or way, and rate")
-        driven = Driven(_asking(joint, motor), 1.0 if turns else joint.length)
-        found.append(("motor", lambda _: driven, ("external_work", -1.0)))
-    return tuple(OnJoint(joint, *each, turns=turns) for each in found)
+        driven = driven_by(joint, names[2], motor, 1.0 if turns else joint.length)
+        found.append((names[2], driven, ("external_work", -1.0)))
+    return tuple(
+        OnJoint(joint, name.replace("_", " "), law, entry, *measure)
+        for name, law, entry in found
+    )
 
 
-def _both(limits: Any) -> tuple[float, float]:
+def cone(joint: Any, given: Any) -> tuple[OnJoint, ...]:
+    """The limit of the angle between one direction in A and in B, if it is given. Collective.
+
+    Args:
+        joint: A joint that lets A turn.
+        given: The direction at the start, of any length, and the angle [rad]; or None.
+
+    Raises:
+        ValueError: It is no direction, or the angle is not between 0 and pi.
+    """
+    if given is None:
+        return ()
+    require_same(joint.comm, cone=given)
+    try:
+        axis, angle = given
+        most = float(angle)
+    except (TypeError, ValueError):
+        axis, most = None, np.nan
+    if not 0.0 < most < np.pi:
+        raise ValueError(
+            f"cone={given!r} of {joint.name!r}: pass a direction and the largest angle from it, "
+            "between 0 and pi [rad], e.g. ((0, 0, 1), 0.5)"
+        )
+    (a,), (b,) = joint.directions(direction(f"cone of {joint.name!r}", axis)[None])
+    law = Limits(joint.length * float(np.cos(most)), np.inf)
+    entry = "contact_defect", 1.0
+    return (OnJoint(joint, "cone", law, entry, kernel.Along, (a, b), joint.length),)
+
+
+def driven_by(joint: Any, argument: str, function: Any, unit: float) -> Driven:
+    """A user's function of time, measure and rate as a law.
+
+    Args:
+        joint: What it acts in.
+        argument: Its name.
+        function: The user's.
+        unit: As of `Driven`.
+
+    Raises:
+        TypeError: It is no function.
+    """
+    if not callable(function):
+        raise TypeError(f"{argument}={function!r}: pass a function of time, angle or way, and rate")
+    return Driven(_asking(joint, argument, function), unit)
+
+
+def _both(name: str, limits: Any) -> tuple[float, float]:
     try:
         low, high = (float(limit) for limit in limits)
     except (TypeError, ValueError):
         low = high = np.nan
     if not (low <= 0.0 <= high and (is_finite(low) or is_finite(high))):
         raise ValueError(
-            f"limits={limits!r}: pass the smallest and the largest angle [rad] or way [m] from the "
+            f"{name}={limits!r}: pass the smallest and the largest angle [rad] or way [m] from the "
             "start, around 0, e.g. (-1.0, 0.5); infinite is no limit"
         )
     return low, high
 
 
-def _asking(joint: Any, motor: Motor) -> Callable[..., FloatArray]:
-    """Calls a motor's function for arrays of measures and rates. Collective."""
+def _asking(joint: Any, argument: str, motor: Motor) -> Callable[..., FloatArray]:
+    """Calls a function for arrays of measures and rates. Collective."""
 
     def of(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
         pairs = zip(at.ravel(), rate.ravel(), strict=True)
@@ -212,7 +261,7 @@ def _asking(joint: Any, motor: Motor) -> Callable[..., FloatArray]:
 
     def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
         return call_together(
-            joint.comm, f"motor of {joint.name!r}", of, time, at, rate, shown=motor
+            joint.comm, f"{argument} of {joint.name!r}", of, time, at, rate, shown=motor
         )
 
     return ask

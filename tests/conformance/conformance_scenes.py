@@ -79,7 +79,7 @@ def rigid_on_rubber(frame):
 
 
 def mechanism(frame):
-    """Three rigid links: a hinge, a ball joint, a slider; a spring and a damper."""
+    """Three rigid links: a hinge, a ball joint, a slider; a spring, a damper, two actuators."""
     links = [
         _rigid(frame, (k, -0.1, -0.1), (k + 1, 0.1, 0.1), f"link {k}", cells=(1, 1, 1))
         for k in range(3)
@@ -95,6 +95,14 @@ def mechanism(frame):
         nts.Damper(
             None, links[2], [frame.place(2, 1, 1), frame.place(3, 0, 0)],
             damping=frame.size(50.0, 3), name="damper",
+        ),
+        nts.Torque(
+            links[0], None, axis=frame.axis(0, 1, 0), name="torque",
+            torque=lambda t, a, rate: frame.size(20.0 * np.cos(10 * t) - 30.0 * a - rate, 5),
+        ),
+        nts.Thrust(
+            links[0], links[2], [frame.place(0.5, 0, 0.1), frame.place(2.5, 0, 0.1)], name="thrust",
+            force=lambda t, x, rate: frame.size(20.0, 4) - 10.0 * frame.size(rate, 3),
         ),
     ]  # fmt: skip
     return nts.System(links, joints=joints, gravity=_gravity(frame))

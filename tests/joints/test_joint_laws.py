@@ -169,6 +169,87 @@ def test_a_motor_does_work():
     assert run.balance["kinetic"][-1] == pytest.approx(energy, rel=1e-4)
 
 
+def spinning(**laws):
+    """A body on a rail along z, about which it turns, too; it rises by 1 m/s and turns by 2/s."""
+    body = nts.RigidBody.from_inertia(
+        MASS, (0.1, 0.1, INERTIA), name="nut", velocity=(0, 0, 1.0), angular_velocity=(0, 0, 2.0)
+    )
+    rail = nts.Cylindrical(body, None, point=(0, 0, 0), axis=(0, 0, 1), name="rail", **laws)
+    return body, nts.System([body], joints=[rail])
+
+
+@rules
+def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
+    """Friction that brakes both, each after v^2 m/(2 b); a motor that makes it a screw."""
+    friction = {
+        "sliding_friction": nts.JointFriction(bound=3.0),
+        "turning_friction": nts.JointFriction(bound=0.4),
+    }
+    body, system = spinning(**friction)
+    run = nts.simulate(system, rule, dt=0.01, t_end=1.5)
+    assert_closed(run)
+    assert body.position[2] == pytest.approx(1.0 * MASS / (2 * 3.0), rel=1e-3)
+    turned = np.arctan2(body.rotation[1, 0], body.rotation[0, 0])
+    assert turned == pytest.approx(2.0**2 * INERTIA / (2 * 0.4), rel=1e-3)
+    body, system = spinning(
+        sliding_limits=(-0.5, 0.2), sliding_motor=lambda t, s, rate: 2.0 - 6.0 * rate,
+        turning_limits=(-0.5, 0.5), turning_motor=lambda t, a, rate: -1.0 - 0.3 * rate,
+        turning_friction=nts.JointFriction(bound=0.1),
+    )  # fmt: skip
+    run = nts.simulate(system, rule, dt=0.01, t_end=3.0)
+    assert run.status == "completed"
+    assert body.position[2] == pytest.approx(0.2, abs=1e-11)
+    assert np.arctan2(body.rotation[1, 0], body.rotation[0, 0]) == pytest.approx(-0.5, abs=1e-11)
+    held = run.reactions["rail sliding limits"][-2:, 0, 2].mean()
+    assert held == pytest.approx(-2.0, abs=1e-6)
+
+
+@rules
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
+    """A pendulum on a ball joint with a damper comes to rest 0.4 rad below the horizontal."""
+    body = nts.RigidBody.from_inertia(
+        MASS * unit**3, np.array([0.01, 0.1, 0.1]) * unit**5, centre=(ARM * unit, 0, 0), name="arm"
+    )
+    ball = nts.Spherical(
+        body, None, point=(0, 0, 0), cone=((3.0, 0, 0), 0.4), name="ball"
+    )
+    friction = nts.TorsionDamper(body, None, axis=(0, 1, 0), damping=2.0 * unit**5)
+    system = nts.System([body], joints=[ball, friction], gravity=(0, 0, -G * unit))
+    run = nts.simulate(system, rule, dt=0.02, t_end=2.0)
+    assert_closed(run)
+    assert angle(body) == pytest.approx(0.4, abs=1e-10)
+    assert body.position[1] == pytest.approx(0.0, abs=1e-12 * unit)
+    moment = MASS * G * ARM * np.cos(0.4) * unit**5
+    # At rest on a limit what the scheme leaves of the last step's speed alternates.
+    held = run.reactions["ball cone"][-2:, 1, 1].mean()
+    assert held == pytest.approx(-moment, rel=1e-6)
+
+
+@pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
+def test_actuators_make_an_oscillator(rule):
+    """T = -k a about an axis, F = -k (l - l_0) along a line: half a period, by the second order."""
+    stiff, start = 0.2, 0.5
+    omega = np.sqrt(stiff / INERTIA)
+    disc_ = nts.RigidBody.from_inertia(1.0, (0.1, 0.1, INERTIA), name="disc")
+    mass = nts.RigidBody.from_inertia(MASS, (1, 1, 1), centre=(3.0, 0, 0), name="mass")
+    joints = [
+        nts.Revolute(disc_, None, point=(0, 0, 0), axis=(0, 0, 1)),
+        nts.Torque(
+            disc_, None, axis=(0, 0, 2), torque=lambda t, a, rate: -stiff * (a - start), name="coil"
+        ),
+        nts.Thrust(
+            mass, None, [(3.0, 0, 0), (0, 0, 0)], name="cylinder",
+            force=lambda t, x, rate: -omega**2 * MASS * (x - 2.5),
+        ),
+    ]  # fmt: skip
+    run = nts.simulate(nts.System([disc_, mass], joints=joints), rule, dt=0.02, t_end=np.pi / omega)
+    assert np.arctan2(disc_.rotation[1, 0], disc_.rotation[0, 0]) == pytest.approx(1.0, abs=2e-4)
+    assert mass.position == pytest.approx([2.0, 0, 0], abs=2e-4)
+    if rule in MID_STEP.values():
+        assert_closed(run)
+
+
 def test_a_run_goes_on_with_laws_from_a_checkpoint(tmp_path):
     laws = {"friction": nts.JointFriction(bound=1.0), "limits": (-1.0, 0.4)}
     path = COMM.bcast(tmp_path) / "run.h5"
@@ -206,3 +287,14 @@ def test_wrong_laws(laws, error, text):
         disc(0.0, **laws)
     with pytest.raises(ValueError, match="bound=0.0: must be"):
         nts.JointFriction(bound=0.0)
+    wrong = [(0, 0, 1), ((0, 0, 1), 0.0), ((0, 0, 1), 4.0), 0.5, ((0, 0, 1), "far")]
+    for given in wrong:
+        body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="a")
+        with pytest.raises(ValueError, match=r"cone=.* of 'ball': pass a direction and the"):
+            nts.Spherical(body, None, point=(0, 0, 0), cone=given, name="ball")
+    with pytest.raises(TypeError, match=r"torque=3\.0: pass a function of time"):
+        nts.Torque(body, None, axis=(0, 0, 1), torque=3.0)
+    with pytest.raises(ValueError, match="they coincide"):
+        nts.Thrust(body, None, [(0, 0, 0), (0, 0, 0)], force=lambda t, x, rate: 1.0)
+    with pytest.raises(ValueError, match=r"turning_limits=\(1, 2\): pass the smallest"):
+        nts.Cylindrical(body, None, point=(0, 0, 0), axis=(0, 0, 1), turning_limits=(1, 2))
