@@ -92,8 +92,9 @@ class InversionGuard:
             over = forbidden(system, smallest_dets(system, u)) - low
             worst = int(over.argmin())
             if over[worst] <= 0.0:
-                sure = bool(over[worst] + low[worst] <= _KEPT_DET)
-                return worst, "; ".join(describe(system.bodies[worst], u[worst])), sure
+                body = system.bodies[worst]
+                sure = body.oriented or bool(over[worst] + low[worst] <= _KEPT_DET)
+                return worst, "; ".join(describe(body, u[worst])), sure
         return None
 
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
