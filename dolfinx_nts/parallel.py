@@ -130,7 +130,7 @@ def write_on_root(comm: MPI.Comm, what: str, action: Callable[[], Any]) -> Any:
 
 
 def need_kernels(comm: MPI.Comm) -> None:
-    """Compile the kernels of contact where they are not there. Collective.
+    """Compile the kernels of contact and joints where they are not there. Collective.
 
     Raises:
         RuntimeError: On all ranks, if one of them cannot.

@@ -113,7 +113,7 @@ class System:
                 before = tuple(self.edges.values())
                 self.edges[k] = EdgeContact(pair, numbers, before)
         check_shared(self.contacts)
-        if self.contacts:
+        if self.contacts or self.joints:
             need_kernels(self.comm)
         start = self.initial_state()
         for pair, where in zip(self.pairs, self.pair_bodies, strict=True):

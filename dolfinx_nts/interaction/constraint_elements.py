@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.interaction.point_elements import PointElements
+from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -167,37 +168,18 @@ class ConstraintElements(PointElements):
         weights, constants, _ = self.equations
         return kernel.factors(weights, constants, self.y0)
 
-    @cached_property
-    def _bent(self) -> FloatArray:
-        """Largest entry of each constraint's curvature [1/m], shape (n, m)."""
-        return np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
-
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
         """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""
         weights, constants, _ = self.equations
         n, m, _, k = weights.shape
-        last, scale = 3 * k, self.scale[:, None]
-        multiplier = scale * own["constraints"]
-        end = kernel.factors(weights, constants, x)
-        middle = self._start + self.theta * (end - self._start)
-        force = kernel.gradient(weights, middle).reshape(n, m, last)
-        gap = kernel.value(end) - self.prescribed[1]
-        residual = np.empty((n, last + m))
-        residual[:, :last] = np.matmul(multiplier[:, None], force)[:, 0]
-        residual[:, last:] = scale * gap
-        tangent = np.zeros((n, last + m, last + m))
-        bent = self._bent
-        if bent.any():
-            curvature = self.curvature.reshape(n, m, k * k)
-            bend = np.matmul(self.theta * multiplier[:, None], curvature).reshape(n, k, k)
-            for i in range(3):
-                tangent[:, i:last:3, i:last:3] = bend
-        tangent[:, :last, last:] = (scale[:, :, None] * force).transpose(0, 2, 1)
-        gradient = kernel.gradient(weights, end).reshape(n, m, last)
-        tangent[:, last:, :last] = scale[:, :, None] * gradient
-        if self.lent.any():
-            rows, lent = np.arange(last, last + m), self.lent[:, None]
-            tangent[:, rows, rows] = -scale * np.where(lent > 0.0, lent + np.abs(gap) * bent, 0.0)
+        size = 3 * k + m
+        multiplier = self.scale[:, None] * own["constraints"]
+        residual, tangent, gap = np.zeros((n, size)), np.zeros((n, size, size)), np.empty((n, m))
+        library.run(
+            library.load().constraints, k, m, self.theta, n, weights, constants, self.prescribed[1],
+            self._start, self.curvature, x, multiplier, self.scale, self.lent,
+            residual, tangent, gap,
+        )  # fmt: skip
         return ConstraintPart(residual, tangent, multiplier, gap, self.y0, x)
 
     def ratios(

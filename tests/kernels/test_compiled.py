@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from facet_kinds import CENTRE, FLAT, KINDS
 from measures import relative
-from twins import closest, laws, obstacle, points, surface
+from twins import closest, constraints, laws, obstacle, points, surface
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.contact_law import ContactLaw, Rub, Together
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
-from dolfinx_nts.kernels import compiled, compiled_law, facets, library
+from dolfinx_nts.interaction.constraint_elements import ConstraintElements
+from dolfinx_nts.interaction.constraint_rows import Equations
+from dolfinx_nts.kernels import compiled, compiled_law, facets, library, quadratic
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.parallel import need_kernels
 
@@ -350,3 +352,25 @@ def test_what_a_rank_lacks_is_told_on_all(monkeypatch):
         monkeypatch.setattr(library, "load", fail)
     with pytest.raises(RuntimeError, match="no compiler"):
         need_kernels(comm)
+
+
+@pytest.mark.parametrize("theta", [0.5, 0.7])
+@pytest.mark.parametrize(("nodes", "count"), [(3, 6), (8, 3), (4, 1)])
+def test_constraints_are_those_of_numpy(nodes, count, theta):
+    """Some weights are zero, some constraints are linear, and some are lent compliance."""
+    rng = np.random.default_rng(nodes)
+    weights = rng.normal(size=(N, count, 2, nodes)) * (rng.random((N, count, 2, nodes)) < 0.6)
+    weights[::3, :, 0] = 0.0
+    equations = Equations(weights, rng.normal(size=(N, count, 2, 3)), np.zeros((N, count)))
+    x, y0 = rng.normal(size=(2, N, nodes, 3))
+    batch = ConstraintElements(
+        name="joint", sides=(), equations=equations, curvature=quadratic.curvature(weights),
+        rest=x, prescribed=rng.normal(size=(2, N, count)), y0=y0, scale=rng.uniform(1, 2, N),
+        theta=theta, lent=np.where(np.arange(N) % 2, 0.0, 1e-3), extents=np.ones(N),
+        names=("joint",), joint=np.zeros(N, dtype=int), moves=False,
+    )  # fmt: skip
+    own = {"constraints": rng.normal(size=(N, count))}
+    found = batch.evaluate(x, own)
+    expected = constraints.evaluate(batch, x, own)
+    for a, b in zip((found.residual, found.tangent, found.gap), expected, strict=True):
+        assert relative(a, b) < 1e-14
