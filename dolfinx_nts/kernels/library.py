@@ -21,7 +21,7 @@ import numpy as np
 
 _NAMES = (
     *("facets.h", "nts_element.h", "facets.c", "nts_element.c", "surface_points.c"),
-    *("segments.c", "contact_law.c", "edges.c"),
+    *("segments.c", "contact_law.c", "edges.c", "node_sums.c"),
 )
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
@@ -134,6 +134,7 @@ _KERNELS = {
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
+    "node_sums": (_INT, _INT, _LONG, *(_ARRAY,) * 5),
 }
 
 
