@@ -130,7 +130,7 @@ _KERNELS = {
         *(_ARRAY,) * 21,
     ),
     "law_of_sums": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 5),
-    "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
+    "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 17),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
