@@ -296,7 +296,7 @@ class ContactLaw(Batch):
             held = prescribed.held(x, self.still, self.slid)
         return compiled_law.laws(
             self._kernel, together, found.residual, found.tangent, found.gap, found.slip,
-            multiplier, held, found.normal,
+            multiplier, held, found.normal, found.let_go,
         )  # fmt: skip
 
     # ---- a solution

@@ -53,6 +53,7 @@ class Measured(NamedTuple):
         gap: g_N at t_{n+1} [m], shape (n,).
         slip: Slip; None without friction.
         normal: Where the contact force acts, shape (n, 3); None without friction.
+        let_go: Which are not active, whatever their forces say, shape (n,); None: none is.
     """
 
     residual: FloatArray
@@ -60,6 +61,7 @@ class Measured(NamedTuple):
     gap: FloatArray
     slip: Slip | None = None
     normal: FloatArray | None = None
+    let_go: BoolArray | None = None
 
 
 class ContactMeasure(Protocol):

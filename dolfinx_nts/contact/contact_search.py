@@ -381,8 +381,10 @@ class ContactSearch:
             multipliers[:, 1:] = 0.0
         if not self._step.integrator.inertia and self._carried is self._old:
             near = _TOUCHING * c.candidates.length
-            touching = c.candidates.gap <= np.maximum(near, c.sag)
-            touching |= self._old[self.numbers[k]].force[c.candidates.node] > 0.0
+            carries = self._old[self.numbers[k]].force[c.candidates.node] > 0.0
+            # Where nothing carries yet, bodies may touch at a point and have all means open.
+            sag = 0.0 if anywhere(self._comm, bool(carries.any())) else c.sag
+            touching = carries | (c.candidates.gap <= np.maximum(near, sag))
             gap = c.gap(x)
             multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
         return multipliers

@@ -238,7 +238,7 @@ class FacetGap(Batch):
         At the projection of t_{n+1} the augmented constraints hold, so that the Schur complement
         is the exact tangent.
         """
-        residual, tangent, gap, slip, _ = self._invariants(x, self._fitting(x), multiplier)
+        residual, tangent, gap, slip, *_ = self._invariants(x, self._fitting(x), multiplier)
         places = 3 * x.shape[1]
         stop = places + nts_element.NUM_AUGMENTED
         middle = stop + nts_element.NUM_CONSTRAINTS

@@ -256,8 +256,9 @@ class SurfaceElements(ContactElements):
         gap = points.gap + self.law.overlap
         residual[:, :3] = points.pulls
         residual[:, 3], tangent[:, 3, 0] = gap, 1.0
+        let_go = self._pulled(multiplier[:, 0])
         if width == 1:
-            return Measured(residual, tangent, gap)
+            return Measured(residual, tangent, gap, let_go=let_go)
         gradient = np.zeros((n, 2, 3 + width))
         gradient[:, [0, 1], [1, 2]] = 1.0
         metric = np.tile(np.eye(2), (n, 1, 1))
@@ -265,7 +266,23 @@ class SurfaceElements(ContactElements):
         slip = Slip(value, gradient, metric, np.zeros((n, 2, 2, 3 + width)))
         normal = self.sums.to_slaves(self.measure.normal_between(y))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return Measured(residual, tangent, gap, slip, normal)
+        return Measured(residual, tangent, gap, slip, normal, let_go)
+
+    def _pulled(self, force: FloatArray) -> BoolArray | None:
+        """Which slaves press, though the pressure around them pulls at their nodes.
+
+        Multipliers of nodes that must leave alternate, ring by ring, and one ring would leave in
+        each iteration. No solution has such slaves: where no multiplier pulls, no pressure does.
+
+        Args:
+            force: lambda_A [kg m], shape (slaves,).
+        """
+        if self.law.imposed is not None:
+            return None
+        sums = self.sums
+        there = sums.shape * sums.to_points(force)[:, None]
+        pull: FloatArray = sums.by_slave(there[:, :, None])[:, 0]
+        return (force < 0.0) & (pull > 0.0)
 
     def _write_law(
         self, residual: FloatArray, tangent: FloatArray, rows: FloatArray, slopes: FloatArray

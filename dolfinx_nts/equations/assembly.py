@@ -26,7 +26,7 @@ class Entries(NamedTuple):
     """Entries of the tangents of elements, and where they stand in a matrix, shape (n,) each.
 
     Attributes:
-        where: Where they stand among all entries of all tangents, one after the other.
+        where: Where they stand among the entries of all tangents of their batch.
         rows: Their rows in the matrix.
         cols: Their columns there.
         weights: What they are multiplied by, see `ElementBlocks`; None: nothing.
@@ -62,11 +62,7 @@ class Triplets:
     ) -> None:
         none = np.empty(0, np.int64)
         rows, cols = [none, *(p.rows for p in parts)], [none, *(p.cols for p in parts)]
-        self._index = np.concatenate([none, *(part.where for part in parts)])
-        self._weights: FloatArray | None = None
-        if any(part.weights is not None for part in parts):
-            each = (np.ones(len(p.where)) if p.weights is None else p.weights for p in parts)
-            self._weights = np.concatenate([*each])
+        self._elements = [(part.where, part.weights) for part in parts]
         self._bodies = [_OfBody(a) for a in bodies]
         for k, body in enumerate(self._bodies):
             assert to_whole is not None
@@ -78,17 +74,18 @@ class Triplets:
         self.matrix.setType("aij")
         petsc_compat.set_preallocation_coo(self.matrix, np.concatenate(rows), np.concatenate(cols))
 
-    def set(self, tangents: FloatArray) -> None:
+    def set(self, tangents: Sequence[FloatArray]) -> None:
         """Replace all values. Collective.
 
         Args:
-            tangents: All entries of all elements' tangents, one after the other.
+            tangents: Of each batch of elements, shape (n, r, r).
         """
-        of_bodies = [values for body in self._bodies for values in body.values()]
-        own = tangents[self._index]
-        if self._weights is not None:
-            own *= self._weights
-        petsc_compat.set_values_coo(self.matrix, np.concatenate([own, *of_bodies]))
+        values = [np.empty(0)]
+        for tangent, (where, weights) in zip(tangents, self._elements, strict=True):
+            own = tangent.ravel()[where]
+            values.append(own if weights is None else own * weights)
+        values += [values for body in self._bodies for values in body.values()]
+        petsc_compat.set_values_coo(self.matrix, np.concatenate(values))
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
@@ -181,8 +178,10 @@ class StepMatrix:
                 of_bodies = (bodies, layouts[0].to_system) if first else ()
                 self._parts.append(Triplets(layout.comm, size, parts, *of_bodies))
         self._by_nodes: node_blocks.NodeBlocks | None = None
+        self._sums: list[node_blocks.NodeSums] = []
         if found is not None:
             of_elements = [number for _, number in self._corner_numbers]
+            self._sums = [node_blocks.NodeSums(*each) for each in self._corner_numbers]
             self._by_nodes = node_blocks.NodeBlocks(
                 bodies, found, layouts[0].to_system, of_elements
             )
@@ -204,18 +203,17 @@ class StepMatrix:
         of_cols: Sequence[tuple[IntArray, IntArray]],
     ) -> list[Entries]:
         """Of each batch what can be non-zero in some rows and columns, as of `_numbers`."""
-        found, first = [], 0
+        found = []
         for block, rows, cols in zip(self._elements, of_rows, of_cols, strict=True):
             size = len(block.pattern)
             i, j = np.nonzero(block.pattern[np.ix_(rows[0], cols[0])])
             where = rows[0][i] * size + cols[0][j]
             row, col = rows[1][:, i], cols[1][:, j]
-            kept, start = (row >= 0) & (col >= 0), first + size**2 * np.arange(len(row))
+            kept, start = (row >= 0) & (col >= 0), size**2 * np.arange(len(row))
             weights = None
             if block.weights is not None:
                 weights = (_weights(block, rows[0])[:, i] * _weights(block, cols[0])[:, j])[kept]
             found.append(Entries((start[:, None] + where)[kept], row[kept], col[kept], weights))
-            first += size**2 * len(row)
         return found
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
@@ -227,9 +225,8 @@ class StepMatrix:
         """
         if self._by_nodes:
             self._assemble_nodes(self._by_nodes, tangents, fresh or self.operator is None)
-        values = _joined(tangents)
         for part in self._parts:
-            part.set(values)
+            part.set(tangents)
         if fresh and self._schur is not None:
             self._schur.renew_bodies(self.corner)
         if self.operator is None:
@@ -248,16 +245,9 @@ class StepMatrix:
         """Bring a corner in blocks up to the bodies' matrices and the elements. Collective."""
         if fresh:
             blocks.fill(self.corner)
-        here = []
-        for (columns, _), tangent in zip(self._corner_numbers, tangents, strict=True):
-            first, count = int(columns[0]) if len(columns) else 0, len(columns)
-            # Most often they are a row, and need no copy.
-            row = np.array_equal(columns, np.arange(first, first + count))
-            some: Any = slice(first, first + count) if row else columns
-            here.append(tangent[:, some][:, :, some])
-        for k, ((_, numbers), block) in enumerate(zip(self._corner_numbers, here, strict=True)):
-            change = block if fresh else block - self._in_operator[k]
-            node_blocks.add(self.corner, numbers, change)
+        here = [sums.of(tangent) for sums, tangent in zip(self._sums, tangents, strict=True)]
+        for k, (sums, values) in enumerate(zip(self._sums, here, strict=True)):
+            sums.add(self.corner, values if fresh else values - self._in_operator[k])
         self.corner.assemble()
         self._in_operator = here
 
@@ -353,9 +343,3 @@ def _weights(block: ElementBlocks, columns: IntArray) -> FloatArray:
     if len(columns) and columns[-1] == last[-1]:
         out[:, -len(last) :] = weights
     return out
-
-
-def _joined(tangents: Sequence[FloatArray]) -> FloatArray:
-    """All entries of tangents, one after the other; a single batch is not copied."""
-    flat = [tangent.ravel() for tangent in tangents]
-    return flat[0] if len(flat) == 1 else np.concatenate([np.empty(0), *flat])

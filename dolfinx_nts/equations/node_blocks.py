@@ -12,12 +12,12 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
-from dolfinx_nts.types import Array, IntArray
+from dolfinx_nts.kernels import library
+from dolfinx_nts.types import Array, FloatArray, IntArray
 
 #: Nodes at a time.
 _CHUNK = 500
@@ -147,28 +147,44 @@ class NodeBlocks:
         matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)
 
 
-def add(matrix: PETSc.Mat, numbers: IntArray, values: npt.NDArray[np.float64]) -> None:
-    """Add blocks of elements to a BAIJ matrix, to be assembled.
+class NodeSums:
+    """The blocks of a batch of elements between nodes, of which many stand at the same place.
+
+    PETSc takes longer to find a block's place than to add to it, so they are summed up before.
 
     Args:
-        matrix: The matrix.
-        numbers: Of the elements' coordinates in the matrix, three to a node, shape (n, 3 nodes);
-            negative ones are left out.
-        values: Shape (n, 3 nodes, 3 nodes).
+        columns: Of coordinates in the elements' tangents, three to a node, shape (3 nodes,).
+        numbers: Of these in the matrix, shape (n, 3 nodes); negative ones are left out.
     """
-    n, count = len(numbers), numbers.shape[1] // 3
-    out = numbers < 0
-    if out.any():
-        values = np.where(out[:, :, None] | out[:, None], 0.0, values)
-    node = (numbers.reshape(n, count, 3).max(axis=2) // 3).astype(PETSc.IntType)
-    matrix.setValuesBlockedIJV(
-        np.arange(n * count + 1, dtype=PETSc.IntType) * count,
-        np.repeat(node, count, axis=0),
-        # petsc4py reads an array in Fortran's order as it lies in memory.
-        np.ascontiguousarray(values.reshape(n, count, 3, count, 3).transpose(0, 1, 3, 2, 4)),
-        addv=PETSc.InsertMode.ADD_VALUES,
-        rowmap=node,
-    )
+
+    def __init__(self, columns: IntArray, numbers: IntArray) -> None:
+        n, count = len(numbers), numbers.shape[1] // 3
+        self._columns, self._numbers = (a.astype(np.int64) for a in (columns, numbers))
+        node = numbers.reshape(n, count, 3).max(axis=2, initial=-1) // 3
+        row, col = np.broadcast_arrays(node[:, :, None], node[:, None])
+        on, width = (row >= 0) & (col >= 0), int(node.max(initial=0)) + 1
+        place, where = np.unique(row[on] * width + col[on], return_inverse=True)
+        self._where = np.full(on.shape, -1)
+        self._where[on] = where
+        rows, cols = np.divmod(place, width)
+        rows, first = np.unique(rows, return_index=True)
+        self._rows, self._cols, self._start = (
+            a.astype(PETSc.IntType) for a in (rows, cols, np.append(first, len(place)))
+        )
+
+    def of(self, tangents: FloatArray) -> FloatArray:
+        """Sums of the elements' tangents (n, r, r), shape (blocks, 3, 3)."""
+        out, width = np.zeros((len(self._cols), 3, 3)), tangents.shape[1]
+        count = len(self._columns) // 3
+        given = self._columns, self._numbers, self._where, tangents
+        library.run(library.load().node_sums, count, width, len(self._numbers), *given, out)
+        return out
+
+    def add(self, matrix: PETSc.Mat, values: FloatArray) -> None:
+        """Add sums to a matrix of blocks, to be assembled."""
+        matrix.setValuesBlockedIJV(
+            self._start, self._cols, values, addv=PETSc.InsertMode.ADD_VALUES, rowmap=self._rows
+        )
 
 
 def _most_couplings(comm: MPI.Comm, first: IntArray, elements: Sequence[IntArray]) -> IntArray:

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.joints import laws
 from dolfinx_nts.joints.between import ROUNDED, Between, Product, Times, Vector, triad
-from dolfinx_nts.joints.laws import JointFriction, Motor
+from dolfinx_nts.joints.laws import JointFriction, Motor, cone_limit, laws_on
 from dolfinx_nts.types import Places
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -63,7 +62,7 @@ class Spherical(Between):
         super().__init__(a, b, ("point", point, point), name)
         if displacement is not None:
             self.drive("displacement", displacement, "m", at_time)
-        self.parts = laws.cone(self, cone)
+        self.parts = cone_limit(self, cone)
 
     def products(self, times: Times) -> Iterator[Product]:
         """p_A - p_B = c."""
@@ -153,7 +152,7 @@ class Revolute(_WithAxis):
         super().__init__(a, b, point=point, axis=axis, name=name)
         if angle is not None:
             self.drive("angle", angle, "rad", number_at)
-        self.parts = laws.laws_on(self, friction, limits, motor, turns=True)
+        self.parts = laws_on(self, friction, limits, motor, turns=True)
 
     def products(self, times: Times) -> Iterator[Product]:
         """Spherical, parallel axes, and the angle.
@@ -226,8 +225,8 @@ class Cylindrical(_WithAxis):
         sliding = sliding_friction, sliding_limits, sliding_motor
         turning = turning_friction, turning_limits, turning_motor
         self.parts = (
-            *laws.laws_on(self, *sliding, turns=False, word="sliding_"),
-            *laws.laws_on(self, *turning, turns=True, word="turning_"),
+            *laws_on(self, *sliding, turns=False, word="sliding_"),
+            *laws_on(self, *turning, turns=True, word="turning_"),
         )
 
     def products(self, times: Times) -> Iterator[Product]:
@@ -273,7 +272,7 @@ class Prismatic(_WithAxis):
         super().__init__(a, b, point=point, axis=axis, name=name)
         if displacement is not None:
             self.drive("displacement", displacement, "m", number_at)
-        self.parts = laws.laws_on(self, friction, limits, motor, turns=False)
+        self.parts = laws_on(self, friction, limits, motor, turns=False)
 
     def products(self, times: Times) -> Iterator[Product]:
         """Cylindrical, m1_A . m2_B = 0, and n_A . (p_A - p_B) = c where it is prescribed."""

@@ -190,7 +190,7 @@ def laws_on(
     )
 
 
-def cone(joint: Any, given: Any) -> tuple[OnJoint, ...]:
+def cone_limit(joint: Any, given: Any) -> tuple[OnJoint, ...]:
     """The limit of the angle between one direction in A and in B, if it is given. Collective.
 
     Args:

@@ -85,6 +85,7 @@ def laws(
     multiplier: FloatArray,
     held: FloatArray | None,
     normal: FloatArray | None,
+    let_go: BoolArray | None,
 ) -> Obeyed:
     """Write the laws of contact and friction into the rows of pairs.
 
@@ -98,6 +99,7 @@ def laws(
         multiplier: h^2/2 lambda of the constraints [kg m], shape (n, constraints).
         held: Part of `Law.unmoved` where nothing is said of lambda_T, shape (n, 2, 2), or None.
         normal: Where the contact force acts, shape (n, 3), or None without friction.
+        let_go: As of `Measured`.
 
     Returns:
         The rows, and what follows.
@@ -109,7 +111,7 @@ def laws(
         np.zeros((n, 3)),
     )  # fmt: skip
     both = slip or (None,) * 4
-    given = gap, *both, multiplier, held, normal
+    given = gap, *both, multiplier, held, normal, let_go
     library.run(library.load().laws, law[0], library.Together(*together), n, *given, *out)
     return out
 

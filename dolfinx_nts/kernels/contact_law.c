@@ -197,11 +197,11 @@ static int rub(const Law *law, const Together *together, const Slip *slip, const
    the mean of both ends (theory 16). With mass in rows and columns the whole matrix is in kg, whatever the size of the
    scene.
 
-   Residual (n, size), tangent (n, size, size) and slip come as of the element, and leave as of the step; `held`
-   and `normal` may be NULL as `unmoved` and the slip. */
+   Residual (n, size), tangent (n, size, size) and slip come as of the element, and leave as of the step; `held`,
+   `normal` and `let_go` may be NULL as `unmoved` and the slip. */
 void laws(const Law *law, const Together *together, long n, const double *gap, const double *value,
           const double *gradient, const double *metric, const double *metric_gradient, const double *multiplier,
-          const double *held, const double *normal, double *residual, double *tangent, double *end,
+          const double *held, const double *normal, const unsigned char *let_go, double *residual, double *tangent, double *end,
           unsigned char *active, unsigned char *stick, double *distance, double *force, double *tangential)
 {
     int size = law->size, row = law->row, constraints = size - row;
@@ -229,7 +229,8 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
             if (law->pull > 0.0)
                 none -= pull_of(law, &slip, c, last + constraints - 2, unmoved);
         }
-        active[i] = -last[0] - law->yielding[i] * (gap[i] > 0.0 ? law->opening : 1.0) * gap[i] > none;
+        active[i] = -last[0] - law->yielding[i] * (gap[i] > 0.0 ? law->opening : 1.0) * gap[i] > none
+                    && !(let_go && let_go[i]);
         stick[i] = 0;
         distance[i] = active[i] && law->friction ? distance_of(&slip) : 0.0;
         if (active[i]) {

@@ -21,7 +21,7 @@ import numpy as np
 
 _NAMES = (
     *("facets.h", "nts_element.h", "facets.c", "nts_element.c", "surface_points.c"),
-    *("segments.c", "contact_law.c", "edges.c", "constraints.c"),
+    *("segments.c", "contact_law.c", "edges.c", "constraints.c", "node_sums.c"),
 )
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
@@ -130,11 +130,12 @@ _KERNELS = {
         *(_ARRAY,) * 21,
     ),
     "law_of_sums": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 5),
-    "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
+    "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 17),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
     "constraints": (_INT, _INT, _REAL, _LONG, *(_ARRAY,) * 12),
+    "node_sums": (_INT, _INT, _LONG, *(_ARRAY,) * 5),
 }
 
 

@@ -137,6 +137,20 @@ def ring(inner, outer, cells, name, unit, more=()):
     return nts.Continuum(mesh, elastic, density=1e3, bcs=bcs, name=name)
 
 
+def fitted(interference, around, unit=1.0, **options):
+    """Surfaces of a pin and of its hole that meet, as of `pressed`."""
+    pin = ring(BORE, FIT + interference, (8, around[0]), "pin", unit)
+    hub = ring(FIT, HUB, (8, around[1]), "hub", unit)
+
+    def off(x, radius):
+        return np.hypot(x[0], x[1]) / unit - radius
+
+    return (
+        pin.surface(lambda x: off(x, FIT + interference) > -1e-9),
+        hub.surface(lambda x: off(x, FIT) < 1e-9, **options),
+    )
+
+
 def pressed(interference, around, *, unit=1.0, told=(), how="resolve", **options):
     """Pressure of a pin that is thicker than its hole by `interference`, from its push along x.
 
@@ -147,18 +161,10 @@ def pressed(interference, around, *, unit=1.0, told=(), how="resolve", **options
         how: What becomes of the overlap.
         options: Of the master's surface.
     """
-    pin = ring(BORE, FIT + interference, (8, around[0]), "pin", unit)
-    hub = ring(FIT, HUB, (8, around[1]), "hub", unit)
-
-    def off(x, radius):
-        return np.hypot(x[0], x[1]) / unit - radius
-
-    pair = nts.ContactPair(
-        pin.surface(lambda x: off(x, FIT + interference) > -1e-9),
-        hub.surface(lambda x: off(x, FIT) < 1e-9, **options),
-        interference=how,
-    )
-    run = nts.equilibrium(nts.System([pin, hub], contacts=[pair]), load_steps=2)
+    faces = fitted(interference, around, unit, **options)
+    pair = nts.ContactPair(*faces, interference=how)
+    system = nts.System([face.body for face in faces], contacts=[pair])
+    run = nts.equilibrium(system, load_steps=2)
     assert run.status == "completed" and kinds(run) == list(told)
     table = run.balance
     assert abs(table["ledger_residual"][-1]) < 1e-3 * table["energy"][-1]
@@ -183,6 +189,26 @@ def test_a_pin_pressed_into_a_hole():
 @pytest.mark.slow
 def test_a_pin_pressed_into_a_hole_on_fine_meshes():
     assert pressed(2e-3, (48, 32), smoothing=True) == pytest.approx(lame(2e-3), rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("integration", "swap", "off"),
+    [("surface", False, 0.015), ("surface", True, 0.015), ("nodes", False, 0.2)],
+)
+@pytest.mark.parametrize("around", [(24, 16), (16, 24)])
+def test_shells_of_other_meshes_press_as_the_mean_of_their_chords_overlaps(
+    around, integration, swap, off
+):
+    """Polygons of n sides a quarter are smaller by 2/3 of the sag of their chords in the mean."""
+    faces = fitted(1e-2, around)
+    faces = faces[::-1] if swap else faces
+    pair = nts.ContactPair(*faces, interference="resolve", integration=integration)
+    system = nts.System([face.body for face in faces], contacts=[pair])
+    run = nts.equilibrium(system, load_steps=2)
+    assert run.status == "completed" and kinds(run) == ["flat facets"]
+    pin, hub = (FIT * (1.0 - np.cos(np.pi / 4.0 / n)) for n in around)
+    found = abs(run.contact_forces[-1, 0, 0]) / (FIT * THICKNESS)
+    assert found == pytest.approx(lame(1e-2 + 2.0 / 3.0 * (hub - pin)), rel=off)
 
 
 def test_a_fit_without_clearance_is_pressed_by_the_sag_of_its_chords():

@@ -105,6 +105,7 @@ def test_laws_are_those_of_numpy(law, shared, prescribed, massless):
 
     measured = measure.evaluate(x, None, multiplier)
     measured.gap[::3] = measured.residual[::3, obeyed.row] = 0.0
+    measured = measured._replace(let_go=np.arange(N) % 11 == 4 if shared else None)
 
     def arguments():
         residual, tangent = measured.residual.copy(), measured.tangent.copy()

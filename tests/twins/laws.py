@@ -9,7 +9,7 @@ from twins.friction import length, return_map
 
 def laws(law, x, measured, multiplier, together):
     """Write the laws into the pairs' rows, as `ContactLaw.obey` does; theory 6, 9 and 16."""
-    residual, tangent, gap, slip, normal = measured
+    residual, tangent, gap, slip, normal, let_go = measured
     scale, of_end = law.scale, 1.0 + law.massless
     end = at_end(law, multiplier)
     force, row = end[:, 0], law.row
@@ -18,6 +18,8 @@ def laws(law, x, measured, multiplier, together):
     if slip is not None and law.endless:
         none = none - pull(law, slip, end)
     active = -force - law.yielding * opens * gap > none
+    if let_go is not None:
+        active &= ~let_go
     off = ~active
     residual[off, row] = force[off] / scale[off]
     tangent[off, row] = 0.0
