@@ -58,6 +58,7 @@ from dolfinx_nts.joints import (
     Universal,
 )
 from dolfinx_nts.joints.actuators import Thrust, Torque
+from dolfinx_nts.joints.cable import Cable
 from dolfinx_nts.joints.forces import AboutAxis, BetweenPoints
 from dolfinx_nts.joints.laws import JointFriction
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
@@ -84,6 +85,7 @@ __all__ = [
     "BetweenPoints",
     "Body",
     "BodyMotion",
+    "Cable",
     "Checkpoint",
     "Circle",
     "Clamp",
