@@ -266,9 +266,34 @@ def fold(frame):
     return nts.System([strip], contacts=[nts.SelfContact(sides, friction=0.3)])
 
 
+def hoist(frame):
+    """A load in the bight of an elastic cable from a winch over a jib, which a spring holds."""
+    jib = _rigid(frame, (0, -0.1, -0.1), (2, 0.1, 0.1), "jib", cells=(1, 1, 1))
+    load = _rigid(
+        frame, (1.5, -0.1, -1.2), (1.8, 0.1, -0.9), "load", spin=(0.5, 0.3, 2.0),
+        velocity=(0, 0.4, 0), cells=(1, 1, 1),
+    )  # fmt: skip
+    way = [
+        (None, (0, 0, 0.8)), (jib, (1.4, 0.05, 0.1)), (load, (1.65, 0, -0.9)), (jib, (1.95, 0, 0)),
+    ]  # fmt: skip
+    length = 0.995 * np.linalg.norm(np.diff([x for _, x in way], axis=0), axis=1).sum()
+    joints = [
+        nts.Revolute(jib, None, point=frame.place(0, 0, 0), axis=frame.axis(0, 1, 0)),
+        nts.Spring(
+            jib, None, [frame.place(1.0, 0, 0), frame.place(1.0, 0, -1.0)],
+            stiffness=frame.size(1e4, 3),
+        ),
+        nts.Cable(
+            [(body, frame.place(*x)) for body, x in way], name="cable",
+            axial_stiffness=frame.size(5e4, 4), length=lambda t: frame.size(length - 0.1 * t, 1),
+        ),
+    ]  # fmt: skip
+    return nts.System([jib, load], joints=joints, gravity=_gravity(frame))
+
+
 #: Step [s] of each scene.
 SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
     beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
-    fold: 2e-3,
+    fold: 2e-3, hoist: 5e-3,
 }  # fmt: skip
