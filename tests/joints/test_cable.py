@@ -259,6 +259,34 @@ def test_friction_holds_two_weights_in_equilibrium():
     assert cable.tensions(rest)[[0, 2]] == pytest.approx(np.multiply(masses, G), rel=1e-9)
 
 
+@pytest.mark.parametrize("masses", [(2.6, 2.0), (2.0, 2.6)])
+def test_friction_of_three_eyelets_holds_on_either_side(masses):
+    """They stick as one up to exp(mu angle) of all, here 1.38, and share what holds alike."""
+    mu, pins = 0.1, [(0, 0, 0), (0.5, 0, 0.2), (1.0, 0, 0)]
+    a, b = weight(masses[0], (0, 0, -1.0), "a"), weight(masses[1], (1.0, 0, -1.0), "b")
+    places = [(0, 0, -1.0), *pins, (1.0, 0, -1.0)]
+    cable = nts.Cable(list(zip((a, None, None, None, b), places, strict=True)), friction=mu)
+    rails = [nts.Prismatic(body, None, point=body.position, axis=(0, 0, 1)) for body in (a, b)]
+    system = nts.System([a, b], joints=[cable, *rails], gravity=(0, 0, -G))
+    rest = nts.equilibrium(system, load_steps=2)
+    assert rest.status == "completed"
+    assert a.position == pytest.approx([0, 0, -1.0], abs=1e-9)
+    turned = np.concatenate([[0.0], np.cumsum(angles(np.array(places)))])
+    ratio = np.log(masses[1] / masses[0]) / turned[-1]
+    assert abs(ratio) < mu
+    expected = masses[0] * G * np.exp(ratio * turned)
+    assert cable.tensions(rest) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_run_tells_of_an_elastic_cable_too_fast_for_its_steps():
+    _, _, system = hung(axial_stiffness=1e7)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.05)
+    assert "unresolved" in run.warnings
+    _, _, system = hung(axial_stiffness=1e3)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.05)
+    assert "unresolved" not in run.warnings
+
+
 TACKLE = [(0.0, 1), (0.0, 0), (0.1, 0), (0.1, 1), (0.2, 1), (0.2, 0), (0.3, 0), (0.3, 1), (0.6, 1)]
 
 
@@ -472,6 +500,15 @@ def test_wrong_input(change, error, text):
         nts.Cable([("load", POINTS[0]), (None, POINTS[1])])
     with pytest.raises(ValueError, match=r"points\[1\]\[1\]=\(0, 1\): pass three"):
         nts.Cable([(load, POINTS[0]), (None, (0, 1))])
+
+
+def test_tensions_are_those_of_a_run_of_its_own():
+    cable, system = atwood((2.0, 2.0))
+    other, _ = atwood()
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.01)
+    assert cable.tensions(run) == pytest.approx(2.0 * G)
+    with pytest.raises(ValueError, match="another system than that of 'rope'"):
+        other.tensions(run)
 
 
 @pytest.mark.parametrize("rule", ACCELERATED.values(), ids=ACCELERATED)
