@@ -64,7 +64,7 @@ class Surface:
 
     Attributes:
         body: The body it belongs to.
-        points: As of `Skin`, and so are facets, original, reference, rows and material.
+        points: As of `Skin`, and so are facets, original, reference, rows, material and parts.
         patches: Points that each patch depends on, the corners of its facet first: one patch a
             facet, (m, nc), or with smoothing (m, 16) over quadrilaterals, and three over each
             triangle, one after another, (3 m, q).
@@ -78,6 +78,7 @@ class Surface:
 
     #: For surfaces of one's own that do not call `__init__`.
     _touching: Touching | None = None
+    parts: FloatArray | None = None
     #: What a restart compares beside the facets.
     settings: Mapping[str, Any] = MappingProxyType({})
 
@@ -87,7 +88,8 @@ class Surface:
     ) -> None:
         self.body = body
         (
-            self.points, self.facets, self.original, self.reference, self.rows, self.material
+            self.points, self.facets, self.original, self.reference, self.rows, self.material,
+            self.parts,
         ) = skin  # fmt: skip
         x = self.reference[self.facets]
         self.area = facet_math.tributary_areas(self.facets, x, len(self.points))
@@ -215,8 +217,9 @@ class Surface:
 
     @cached_property
     def mass(self) -> FloatArray:
-        """Mass of the points' nodes [kg], shape (p,). Collective."""
-        return self.material.divided(self.body.nodal_mass)
+        """Mass of the points' nodes [kg], shape (p,), a measure of it > 0. Collective."""
+        # Rows of a tetrahedron of degree 2 have negative sums at its vertices.
+        return self.material.divided(np.abs(self.body.nodal_mass))
 
     @property
     def massless(self) -> npt.NDArray[np.bool_]:
