@@ -18,10 +18,10 @@ from dolfinx_nts.types import FloatArray
 
 def carried_areas(surface: Any) -> FloatArray:
     """Area whose uniform pressure is the force at each point of a `Surface` [m^2], (p,)."""
-    if surface.parts is None:
+    if surface.faces is None:
         tributary: FloatArray = surface.area
         return tributary
-    each = facets.areas(surface.reference[surface.facets])[:, None] * surface.parts
+    each = facets.areas(surface.reference[surface.facets])[:, None] * surface.faces.parts
     found = np.zeros(len(surface.points))
     np.add.at(found, surface.facets, each)
     return found

@@ -82,7 +82,7 @@ def drop_doubles(found: list[ContactElements], forces: Sequence[FloatArray]) -> 
 
 def areas(contacts: Sequence[ContactPair]) -> list[FloatArray]:
     """Area of the pressure at each slave's points [m^2], (points,), with that of later contacts."""
-    own = [carried_areas(c.slave) if c.holds_nodes else c.slave.area for c in contacts]
+    own = [carried_areas(c.slave) for c in contacts]
     found = [area.copy() for area in own]
     for i, j, _ in _beside(contacts):
         one, two = contacts[i].slave, contacts[j].slave

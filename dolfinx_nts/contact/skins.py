@@ -9,6 +9,7 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.faces import Faces
 from dolfinx_nts.contact.linear_facets import body_facets, node_numbers, node_places
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.parallel import gather_rows
@@ -91,8 +92,7 @@ class Skin(NamedTuple):
         rows: Of the points at nodes of the mesh that this rank owns, in order, those nodes'
             positions among the owned ones, shape (n,).
         material: The points as functions of the body's coordinates.
-        parts: What each corner has of the force of a uniform pressure on its facet, (m, nc); None:
-            as the integrals of the facets' own shape functions.
+        faces: Those of degree 2 that the facets are parts of; None: each is one itself.
     """
 
     points: IntArray
@@ -101,7 +101,7 @@ class Skin(NamedTuple):
     reference: FloatArray
     rows: IntArray
     material: Points
-    parts: FloatArray | None = None
+    faces: Faces | None = None
 
 
 def skin_of_mesh(body: Any, local_facets: IntArray) -> Skin:
@@ -112,21 +112,30 @@ def skin_of_mesh(body: Any, local_facets: IntArray) -> Skin:
         local_facets: This rank's owned facets.
     """
     mesh, index_map = body.mesh, body.space.dofmap.index_map
-    local, parts = body_facets(body, local_facets)
-    corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+    found = body_facets(body, local_facets)
+    local = found.corners
+    corners, whole = (
+        index_map.local_to_global(of.ravel().astype(np.int32)).reshape(of.shape)
+        for of in (local, found.nodes)
+    )
     table = gather_rows(mesh.comm, np.stack([corners, node_numbers(body)[local]], axis=-1))
     x = gather_rows(mesh.comm, node_places(body)[local])
     roll, order = in_order(table[..., 1])
     table = np.take_along_axis(table, roll[..., None], axis=1)[order]
     x = np.take_along_axis(x, roll[..., None], axis=1)[order]
-    parts = np.take_along_axis(gather_rows(mesh.comm, parts), roll, axis=1)[order]
-    points, at, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
-    reference = x.reshape(-1, 3)[at]
+    faces = None
+    if (body.degree or 1) > 1:
+        parts, at, nodes = (gather_rows(mesh.comm, a) for a in (found.parts, found.at, whole))
+        parts = np.take_along_axis(parts, roll, axis=1)[order]
+        faces = parts, np.take_along_axis(at, roll[..., None], axis=1)[order], nodes[order]
+    points, first, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
+    reference = x.reshape(-1, 3)[first]
     low, high = index_map.local_range
     rows = points[(points >= low) & (points < high)] - low
     return Skin(
-        points, inverse.reshape(table.shape[:2]), table[..., 1].ravel()[at], reference, rows,
-        body.at_nodes(points, reference), parts if (body.degree or 1) > 1 else None,
+        points, inverse.reshape(table.shape[:2]), table[..., 1].ravel()[first], reference, rows,
+        body.at_nodes(points, reference),
+        None if faces is None else Faces(*faces[:2], np.searchsorted(points, faces[2])),
     )  # fmt: skip
 
 
@@ -147,7 +156,7 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     Collective.
     """
     mesh = body.mesh
-    blocks, _ = body_facets(body, compat.exterior_facets(mesh))
+    blocks = body_facets(body, compat.exterior_facets(mesh)).corners
     moved = fem.Function(body.space)
     here = body.at_mesh(u)
     moved.x.array[: len(here)] = here

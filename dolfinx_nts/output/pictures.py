@@ -158,7 +158,7 @@ def _coloured_facets(body: Any, colour: str) -> tuple[FloatArray, FloatArray]:
     if isinstance(body, DirectorBody):
         return _skin(body)
     mesh, local = body.mesh, compat.exterior_facets(body.mesh)
-    blocks = body_facets(body, local)[0][:, [0, 1, 2, -1]]
+    blocks = body_facets(body, local).corners[:, [0, 1, 2, -1]]
     corners = node_places(body)[blocks] + body.u.x.array.reshape(-1, 3)[blocks]
     if colour == "speed":
         return corners, np.linalg.norm(body.v.x.array.reshape(-1, 3)[blocks], axis=-1)
