@@ -136,8 +136,8 @@ def _oriented(mesh: Mesh, local_facets: IntArray, cells: IntArray, degree: int) 
         both = zip(cell, local_facets, strict=True)
         face = np.array([np.flatnonzero(to_facet.links(c) == f)[0] for c, f in both])
     own, parts, at = cells[cell], faces.parts[face], faces.at[face]
-    found = np.take_along_axis(own, faces.corners[face].reshape(len(cell), -1), axis=1)
-    found = found.reshape(len(cell), facets, corners)
+    of_face = faces.corners[face].reshape(len(cell), facets * corners)
+    found = np.take_along_axis(own, of_face, axis=1).reshape(len(cell), facets, corners)
     # Cells may be numbered either way round.
     turned = _left_handed(mesh.geometry.x[compat.geometry_dofmap(mesh)[cell]], corners)
     for of in (found, parts, at):
