@@ -105,13 +105,16 @@ def test_ranks(cell):
 
 @pytest.mark.mpi
 def test_a_restarted_run_is_the_uninterrupted_one(mpi_tmp_path):
+    """On the same ranks, and on each alone."""
     path = mpi_tmp_path / "run.h5"
     whole = fly(thrown((TET, HEX)), t_end=0.03)
     fly(thrown((TET, HEX)), t_end=0.015, checkpoint=nts.Checkpoint(path, every=6))
-    again = thrown((TET, HEX))
-    run = fly(again, t_end=0.03, start=nts.restart(path, again))
-    assert run.balance["active"].max() >= 4
-    assert difference(whole.balance, run.balance) < 1e-13
+    COMM.barrier()
+    for comm, within in ((COMM, 1e-13), (MPI.COMM_SELF, 1e-10)):
+        again = thrown((TET, HEX), comm=comm)
+        run = fly(again, t_end=0.03, start=nts.restart(path, again))
+        assert run.balance["active"].max() >= 4
+        assert difference(whole.balance, run.balance) < within
 
 
 # ---- pressures and forces
@@ -222,7 +225,7 @@ def dimitriadis(radius, depth, height, nu):
 
 @pytest.mark.slow
 @pytest.mark.mpi
-@pytest.mark.parametrize(("cell", "within"), [(HEX, 0.015), (TET, 0.03)])
+@pytest.mark.parametrize(("cell", "within"), [(HEX, 0.015), (TET, 0.015)])
 def test_indentation(cell, within):
     """A sphere of radius 4 is pressed 1/64 into a layer of 0.5; the facets are 0.6 of a."""
     n, radius, depth = 6, 4.0, 1 / 64
@@ -241,7 +244,7 @@ def test_indentation(cell, within):
 
 @pytest.mark.parametrize(("cell", "within"), [(HEX, 0.009), (TET, 0.025)])
 @pytest.mark.slow
-def test_cantilever_on_a_cylinder(cell, within):
+def test_cantilever_on_a_roller(cell, within):
     """10 x 1 x 1 cells, within what theory 19.6 has for them; cubes of degree 1 are 13 % off.
 
     The cylinder lifts the beam at 9 of its length by 0.1: 3 EI/9^3 0.1.
