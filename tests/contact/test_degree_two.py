@@ -10,6 +10,7 @@ from measures import difference
 from scenes import CELLS, RUBBER, UNITS, at, bottom, box, everywhere, symmetry, top
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.nodal_pressure import carried_areas
 
 COMM = MPI.COMM_WORLD
@@ -294,6 +295,37 @@ def test_a_sliding_block_decelerates_by_mu_g(cell, table):
     assert lost == pytest.approx(mu * gravity * 0.1 * 1e3, rel=0.05)
 
 
+# ---- a press fit
+@pytest.mark.mpi
+@pytest.mark.parametrize("integration", ["nodes", "surface"])
+@pytest.mark.parametrize("inner", [True, False])
+@pytest.mark.fast_on_ranks("True-surface")
+def test_press_fit(integration, inner):
+    """Lame's pressure between two tubes, 6 and 5 curved cells a quarter, whichever is the slave.
+
+    Of as many nodes facets of degree 1 miss it by 30 to 130 %: their chords are as long as the fit.
+    """
+    fit, a, b, c, nu = 4e-3, 1.0, 2.0, 3.0, 0.3
+    bodies, faces = [], []
+    sides = [nts.Dirichlet(everywhere, components=(2,))]
+    for low, high, n in ((a, b + fit, 6), (b, c, 5)):
+        bodies.append(nts.Continuum(
+            quarter_ring(n, inner=low, outer=high), nts.StVenantKirchhoff(1.0, nu), density=1.0,
+            name=f"from {low}", bcs=symmetry() + sides,
+        ))  # fmt: skip
+        on = high if low == a else low
+        faces.append(bodies[-1].surface(lambda x, on=on: np.abs(np.hypot(*x[:2]) - on) < 1e-9))
+    pair = nts.ContactPair(
+        *(faces if inner else faces[::-1]), interference="resolve", integration=integration
+    )
+    run = nts.equilibrium(nts.System(bodies, contacts=[pair]), load_steps=1)
+    assert run.status == "completed"
+    compliance = sum((q**2 + p**2) / (q**2 - p**2) for p, q in ((a, b), (b, c)))
+    pressure = fit / (b * (1 - nu**2)) / compliance
+    # On each of both axes the pressure acts on b.
+    assert np.abs(run.contact_forces[-1, 0, :2]) == pytest.approx(pressure * b, rel=0.01)
+
+
 # ---- edges, corners, itself
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
@@ -329,19 +361,16 @@ def test_a_curved_face_has_no_edges():
     assert len(x) == 2 * 4 + 2 * 2 and np.any([on.all(axis=1) for on in rims], axis=0).all()
 
 
-def quarter_ring(n, comm=COMM):
-    """27-node cells of a quarter of a ring between radii of 1 and 2, 1 high, curved."""
-    from dolfinx_nts import dolfinx_compat as compat
-
-    flat = compat.create_mesh
+def quarter_ring(n, comm=COMM, inner=1.0, outer=2.0):
+    """27-node cells of a quarter of a ring, curved, n along it, one across and 1 high."""
     mesh = box((0, 0, 0), (1, 1, 1), (1, n, 1), HEX, MPI.COMM_SELF)
     space = compat.vector_space(mesh, 2)
     x, cells = space.tabulate_dof_coordinates(), compat.cell_dofs(space)
-    radius, angle = 1 + x[:, 0], 0.5 * np.pi * x[:, 1]
+    radius, angle = inner + (outer - inner) * x[:, 0], 0.5 * np.pi * x[:, 1]
     x = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), x[:, 2]])
     if comm.rank:
         cells, x = cells[:0], x[:0]
-    return flat(comm, cells, x, "hexahedron")
+    return compat.create_mesh(comm, cells, x, "hexahedron")
 
 
 @pytest.mark.mpi
