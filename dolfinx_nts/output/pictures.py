@@ -162,7 +162,7 @@ def _coloured_facets(body: Any, colour: str) -> tuple[FloatArray, FloatArray]:
     corners = node_places(body)[blocks] + body.u.x.array.reshape(-1, 3)[blocks]
     if colour == "speed":
         return corners, np.linalg.norm(body.v.x.array.reshape(-1, 3)[blocks], axis=-1)
-    stress = von_mises(body)
+    stress = von_mises(body, at="cells")
     to_cell = mesh.topology.connectivity(2, 3)
     cells = np.array([to_cell.links(f)[0] for f in local], dtype=np.int64)
     dofs = compat.cell_dofs(stress.function_space)
