@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.contact import search
 from dolfinx_nts.contact.convex_edges import OUTSIDE
 from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.facet_pair import FacetPair
@@ -62,7 +63,7 @@ class Corners(FacetPair):
         return float(global_sum(self.slave.body.comm, history.force.sum(keepdims=True))[0])
 
     def leave_to(self, nodes: Sequence[tuple[Surface, Candidates]], meet: IntArray) -> None:
-        """Note what else holds in a step, before `find`.
+        """Note what else holds in a step, before `find`. Collective.
 
         Args:
             nodes: Candidates among this rank's slaves of the contacts in which the body is a slave,
@@ -70,7 +71,28 @@ class Corners(FacetPair):
             meet: Ends of edges that may meet, two points of the master and two of the slave,
                 shape (k, 4).
         """
-        self._nodes, self._meet = nodes, meet
+        at, self._meet = self.master.points, meet
+        # From all points of the body that is the slave to where they touch what may hold them.
+        self._ways, self._near = np.zeros((len(at), 3)), np.zeros(len(at), dtype=bool)
+        for surface, c in nodes:
+            ways = np.zeros((len(surface.share), 4))
+            ways[c.node, :3], ways[c.node, 3] = -c.gap[:, None] * c.normal, 1.0
+            ways, points = surface.at_all(ways), surface.points
+            if points is not at:
+                _, own, other = np.intersect1d(at, points, return_indices=True)
+                found, ways = ways[other], np.zeros((len(at), 4))
+                ways[own] = found
+            near = ways[:, 3] > 0.0
+            self._ways[near], self._near = ways[near, :3], self._near | near
+
+    def _closest(
+        self, slaves: FloatArray, corners: FloatArray, reach: float, current: IntArray
+    ) -> search.Closest:
+        """As of `FacetPair`, but for those that something else holds. Collective."""
+        found = super()._closest(slaves, corners, reach, current)
+        node = np.flatnonzero(found.facet >= 0)
+        found.facet[node[self._held(node, found.facet[node], slaves, corners)]] = -1
+        return found
 
     def find(
         self,
@@ -82,11 +104,11 @@ class Corners(FacetPair):
     ) -> Found:
         """As of `ContactPair`, but for those that something else holds. Collective."""
         found = super().find(positions, current, path, motion, followed)
-        self._feet, self._near = self._places(positions[1])
         c = found.candidates
         if not len(c.node):
             return found
-        held = self._held(c.node, c.facet, positions)
+        # Their ways may have led them to other facets.
+        held = self._held(c.node, c.facet, positions[0], positions[1][self.master.facets])
         # What they enter meanwhile does not throw them out.
         found.followed[c.node[held & (c.gap < -OUTSIDE * c.length)]] = False
         return found._replace(candidates=c.select(~held))
@@ -103,49 +125,38 @@ class Corners(FacetPair):
         """Do as `ContactPair`, but for those that something else holds."""
         hit = super().missed(positions, motions, path, reach, held, aimed)
         if hit is not None:
-            node = np.flatnonzero(hit >= 0)
-            hit[node[self._held(node, hit[node], positions)]] = -1
+            node, corners = np.flatnonzero(hit >= 0), positions[1][self.master.facets]
+            hit[node[self._held(node, hit[node], positions[0], corners)]] = -1
         return hit
 
-    def _places(self, slaves: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Where all slaves touch what holds them, shape (p, 3), and which may. Collective.
-
-        Args:
-            slaves: Points of the slave at t_n [m].
-        """
-        feet, near = slaves.copy(), np.zeros(len(slaves), dtype=bool)
-        for surface, c in self._nodes:
-            ways = np.zeros((len(surface.share), 4))
-            ways[c.node, :3], ways[c.node, 3] = -c.gap[:, None] * c.normal, 1.0
-            ways = surface.at_all(ways)
-            _, own, other = np.intersect1d(self.master.points, surface.points, return_indices=True)
-            own, other = own[ways[other, 3] > 0.0], other[ways[other, 3] > 0.0]
-            feet[own], near[own] = slaves[own] + ways[other, :3], True
-        return feet, near
-
-    def _held(self, node: IntArray, facet: IntArray, x: Sequence[FloatArray]) -> BoolArray:
+    def _held(
+        self, node: IntArray, facet: IntArray, x: FloatArray, corners: FloatArray
+    ) -> BoolArray:
         """Which of this rank's corners over facets something else holds, shape (n,).
 
         Those that stay as good as outside while corners of their facets are where the slave's nodes
-        hold them, on the master, or at edges that meet those of the corner, and the others anywhere
-        within a facet's size.
+        hold them, on what these may touch, or at edges that meet those of the corner, and the
+        others anywhere within a facet's size.
 
         Args:
             node: The corners, shape (n,).
             facet: The facets, shape (n,).
-            x: Points of slave and master at t_n [m].
+            x: Points of the slave at t_n [m].
+            corners: Corners of the master's facets [m].
         """
-        point, at = self.slave.share[node], self.master.facets[facet]
-        corners = x[1][at]
-        xi, _ = compiled.closest_point(x[0][point], corners)
+        if not len(node):
+            return np.zeros(0, dtype=bool)
+        point, at, corners = self.slave.share[node], self.master.facets[facet], corners[facet]
+        xi, _ = compiled.closest_point(x[point], corners)
         weights, _, _ = facets.shape(xi, at.shape[1])
         _, _, normal = facets.frame(corners, xi)
-        rise = np.einsum("ni,nki->nk", normal, self._feet[at] - x[0][point][:, None])
+        rise = np.einsum("ni,nki->nk", normal, corners + self._ways[at] - x[point][:, None])
         rise /= facets.size(corners)[:, None]
         depth = np.where(self._near[at], np.clip(rise, 0.0, 1.0), 1.0)
-        own, k = np.nonzero((point[:, None, None] == self._meet[None, :, :2]).any(axis=2))
-        meets = (at[own][:, :, None] == self._meet[k, None, 2:]).any(axis=2)
-        np.minimum.at(depth, own, np.where(meets, 0.0, 1.0))
+        if len(self._meet):
+            own, k = np.nonzero((point[:, None, None] == self._meet[None, :, :2]).any(axis=2))
+            meets = (at[own][:, :, None] == self._meet[k, None, 2:]).any(axis=2)
+            np.minimum.at(depth, own, np.where(meets, 0.0, 1.0))
         held: BoolArray = np.einsum("nk,nk->n", weights, depth) < _OUTSIDE
         return held
 
