@@ -207,13 +207,14 @@ def handed(integration, swap):
 
 @pytest.mark.slow
 def test_either_side_may_be_the_slave():
-    """Of 2000 kg m/s the first block keeps -39.6 or -39.1; of nodes against facets -33 or -308."""
+    """Of 2000 kg m/s the first block keeps -39.6 or -39.1; of nodes against facets -33 or -64."""
     fine, coarse = (handed("surface", swap) for swap in (False, True))
     assert abs(fine[0] - coarse[0]) < 1.0
     # Theory section 17.5.
     assert abs(fine[1] - 0.0498) < 5e-5 and abs(coarse[1] - 0.0490) < 5e-5
     one, two = (handed("nodes", swap) for swap in (False, True))
-    assert abs(one[0] - two[0]) > 200.0
+    # Without corners of the master, which hold where the slave is the coarse one, -308.
+    assert abs(one[0] - two[0]) < 50.0
 
 
 @pytest.mark.mpi
