@@ -82,6 +82,7 @@ class Surface:
     #: For surfaces of one's own that do not call `__init__`.
     _touching: Touching | None = None
     faces: Faces | None = None
+    smooth = False
     #: What a restart compares beside the facets.
     settings: Mapping[str, Any] = MappingProxyType({})
 

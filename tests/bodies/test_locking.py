@@ -141,3 +141,18 @@ def test_thin_whatever_way_it_is_turned(angle, sides, cells, thin):
     mesh.geometry.x[:] = mesh.geometry.x @ rotation(angle, (1.0, 2.0, 3.0)).T
     body = nts.Continuum(mesh, nts.NeoHookean(young=1.0, poisson=0.3), density=1.0)
     assert body.is_thin == thin
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("volume", ["full", "projected"])
+def test_a_rank_without_a_cell(volume):
+    """One cell: on 2 ranks one of them has none."""
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), (1, 1, 1), CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, volume=volume,
+        velocity=lambda x: np.array([x[1], 0.0 * x[0], 0.0 * x[0]]),
+    )  # fmt: skip
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-3, t_end=0.02)
+    assert run.status == "completed"
+    energy = run.balance["energy"]
+    assert np.abs(energy - energy[0]).max() < 1e-12 * energy[0]

@@ -35,8 +35,8 @@ def cauchy_stress(body: Any, *, at: str = "nodes") -> Any:
     Args:
         body: Continuum with any material.
         at: "nodes": at the corners of cells, the mean of the cells around each, of what follows in
-            each cell from the stress at its Gauss points, where it is most exact. "cells": the mean
-            over each cell's reference volume.
+            each cell from the stress at its Gauss points, where it is most exact; where materials
+            meet, the mean of both. "cells": the mean over each cell's reference volume.
 
     Returns:
         Function of degree 1, or 0 in cells, a 3 x 3 tensor [Pa].
@@ -51,8 +51,9 @@ def cauchy_stress(body: Any, *, at: str = "nodes") -> Any:
 def von_mises(body: Any, *, at: str = "nodes") -> Any:
     """Von Mises measure of the Cauchy stress at `body.u`; collective.
 
-    It is the mean of the measure, not the measure of the mean that `cauchy_stress` gives; DOLFINx
-    writes it in the same way.
+    It is the mean of the measure in cells, or of that of the stress at the corners of the cells
+    around a node, not the measure of the mean that `cauchy_stress` gives; DOLFINx writes it in the
+    same way.
 
     Args:
         body: Continuum with any material.
@@ -68,18 +69,23 @@ def von_mises(body: Any, *, at: str = "nodes") -> Any:
     return _of(body, "von_mises", at)
 
 
-def _value(body: Any, name: str) -> tuple[Any, CellMeans | None]:
-    """Cauchy stress or its von Mises measure in UFL, and the cells' means that it holds."""
+def _cauchy(body: Any) -> tuple[Any, CellMeans | None]:
+    """Cauchy stress in UFL, and the cells' means that it holds."""
     h = ufl.grad(body.u)
     law, means = body.energy()
     f = ufl.Identity(3) + h
-    value = f * law.stress(green_strain(h)) * f.T / ufl.det(f)
+    stress = f * law.stress(green_strain(h)) * f.T / ufl.det(f)
     if means is not None:
         means.compile(body.u)
-    if name == "von_mises":
-        deviator = ufl.dev(value)
-        value = ufl.sqrt(1.5 * ufl.inner(deviator, deviator))
-    return value, means
+    return stress, means
+
+
+def _measure(stress: FloatArray) -> FloatArray:
+    """Von Mises measure of stresses, (..., 9) -> (..., 1)."""
+    tensor = stress.reshape(*stress.shape[:-1], 3, 3)
+    deviator = tensor - np.trace(tensor, axis1=-2, axis2=-1)[..., None, None] / 3 * np.eye(3)
+    found: FloatArray = np.sqrt(1.5 * np.square(deviator).sum(axis=(-2, -1)))
+    return found[..., None]
 
 
 class _InCells:
@@ -91,7 +97,10 @@ class _InCells:
     """
 
     def __init__(self, body: Any, name: str) -> None:
-        value, self._means = _value(body, name)
+        value, self._means = _cauchy(body)
+        if name == "von_mises":
+            deviator = ufl.dev(value)
+            value = ufl.sqrt(1.5 * ufl.inner(deviator, deviator))
         self._name = name
         self._space = compat.function_space(body.mesh, "DG", 0, value.ufl_shape)
         self._sums, q = EntriesOfCells(self._space), ufl.TestFunction(self._space)
@@ -119,10 +128,10 @@ class _AtNodes:
     """
 
     def __init__(self, body: Any, name: str) -> None:
-        value, self._means = _value(body, name)
-        mesh, shape, self._name = body.mesh, value.ufl_shape, name
+        value, self._means = _cauchy(body)
+        mesh, shape, self._name = body.mesh, () if name == "von_mises" else (3, 3), name
         self._space = compat.function_space(mesh, "Lagrange", 1, shape)
-        broken, one = (compat.function_space(mesh, "DG", 1, of) for of in (shape, ()))
+        broken, one = (compat.function_space(mesh, "DG", 1, of) for of in ((3, 3), ()))
         self._sums, column = EntriesOfCells(broken), EntriesOfCells(one)
         unit, dofs = fem.Function(one), compat.cell_dofs(one)
         # Two points in each direction, where the stress of either degree is most exact.
@@ -154,9 +163,12 @@ class _AtNodes:
         """As of `_InCells`."""
         if self._means is not None:
             self._means.evaluate()
-        sums = self._sums(self._form).reshape(*self._nodes.shape, self._width)
+        sums = self._sums(self._form).reshape(*self._nodes.shape, 9)
+        corners = np.matmul(self._inverse, sums)
+        # A measure has no sign: led on itself it would be too small where a section bends.
+        corners = corners if self._width == 9 else _measure(corners)
         result = fem.Function(self._space, name=self._name)
-        values = self._sum(np.matmul(self._inverse, sums)) / self._counts
+        values = self._sum(corners) / self._counts
         result.x.array[: values.size] = values
         result.x.scatter_forward()
         return result
