@@ -73,7 +73,7 @@ def patch(cells: tuple[int, int], kind: CellType, way: str) -> tuple[float, floa
     assert run.status == "completed"
     worst = 0.0
     for body in bodies:
-        stress = nts.cauchy_stress(body).x.array.reshape(-1, 9)[:, 8]
+        stress = nts.cauchy_stress(body, at="cells").x.array.reshape(-1, 9)[:, 8]
         worst = max(worst, float(np.abs(stress / -_STRAIN - 1.0).max()))
     return float(np.abs(pressure(run)[1] / _STRAIN - 1.0).max()), worst
 

@@ -36,6 +36,8 @@ VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 #: UFL-owned elements, AdjacencyList dofmaps.
 OLD = VERSION < (0, 8)
 _SHARED = mesh.GhostMode.shared_facet
+#: Cells of degree 2 and their nodes.
+_CURVED = {("interval", 3), ("tetrahedron", 10), ("hexahedron", 27)}
 #: What FFCx has loaded, by its C file: it lists the whole cache to load one again.
 _LOADED: dict[Path, Any] = {}
 
@@ -50,12 +52,12 @@ def _ghosts() -> dict[str, Any]:
 
 
 def create_mesh(comm: MPI.Comm, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Mesh:
-    """Mesh of degree 1, of intervals with three nodes of degree 2, with shared-facet ghosts.
+    """Mesh of degree 1, or of degree 2 where cells have as many nodes, with shared-facet ghosts.
 
     Args:
         comm: MPI communicator.
-        cells: This rank's part of the cells in DOLFINx vertex order, shape (m, corners); of
-            intervals of degree 2 both ends, then the middle node, shape (m, 3).
+        cells: This rank's part of the cells in DOLFINx order, shape (m, nodes): their corners,
+            then, of degree 2, the middles of edges, of faces and of the cell.
         x: This rank's part of the points [m], shape (n, 3).
         cell_type: Of DOLFINx, e.g. "hexahedron", "tetrahedron", "quadrilateral", "interval".
 
@@ -64,7 +66,7 @@ def create_mesh(comm: MPI.Comm, cells: npt.ArrayLike, x: npt.ArrayLike, cell_typ
     """
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
     _refuse_whole(comm, cells, x)
-    degree = 2 if (cell_type, cells.shape[1]) == ("interval", 3) else 1
+    degree = 2 if (cell_type, cells.shape[1]) in _CURVED else 1
     if OLD:
         cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, degree))
@@ -144,7 +146,9 @@ def entities_to_geometry(msh: Mesh, dim: int, entities: npt.ArrayLike) -> IntArr
         nodes: IntArray = cpp.mesh.entities_to_geometry(_cpp_mesh(msh), dim, entities, False)
     else:
         nodes = mesh.entities_to_geometry(msh, dim, entities)
-    return nodes
+    # Of curved cells later versions have all nodes, those of the vertices first.
+    kind = cpp.mesh.cell_entity_type(t.cell_type, dim, 0)
+    return nodes[:, : cpp.mesh.cell_num_vertices(kind)]
 
 
 def _cpp_mesh(msh: Mesh) -> Any:
@@ -272,15 +276,15 @@ def lagrange_degree(space: fem.FunctionSpace) -> int | None:
 
 
 def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
-    """Return whether a space is of Lagrange elements with one block at each corner of a cell."""
+    """Whether a space is of Lagrange elements with one block at each corner, or at each node."""
     element = space.ufl_element()
     if OLD:
         scalar = (*element.sub_elements(), element)[0]
         broken = scalar.family() not in ("Lagrange", "Q")
     else:
         broken = element.discontinuous
-    same = cell_dofs(space).shape[1] == geometry_dofmap(msh).shape[1]
-    return same and not broken
+    corners = cpp.mesh.cell_num_vertices(msh.topology.cell_type)
+    return cell_dofs(space).shape[1] in (corners, geometry_dofmap(msh).shape[1]) and not broken
 
 
 def function_space(
@@ -300,10 +304,14 @@ def function_space(
 
 
 def node_blocks(mesh: Mesh, space: fem.FunctionSpace) -> IntArray:
-    """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,)."""
-    nodes = geometry_dofmap(mesh)
+    """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,).
+
+    Without one, as between the corners of a curved cell in a space of degree 1, it is -1.
+    """
+    nodes, dofs = geometry_dofmap(mesh), cell_dofs(space)
+    both = min(nodes.shape[1], dofs.shape[1])
     blocks = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
-    blocks[nodes] = cell_dofs(space)[: len(nodes), : nodes.shape[1]]
+    blocks[nodes[:, :both]] = dofs[: len(nodes), :both]
     return blocks
 
 

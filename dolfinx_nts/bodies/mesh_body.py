@@ -32,12 +32,15 @@ class MeshBody(Body):
     ) -> Surface:
         """A part of the boundary for contact.
 
-        With smoothing, a slave touches a smooth surface through the nodes instead of the flat or
-        bilinear facets of a master. It is linear in the nodes, so momentum and energy are kept as
-        without. Over quadrilaterals lie bicubic patches of Overhauser's cubics (Catmull and Rom
-        1974), over each triangle three quartic ones (Clough and Tocher 1965; Shirman and Sequin
-        1987) whose tangent planes fit the rings of its nodes, of any number of neighbours. The
-        normal no longer jumps from facet to facet, and the energy lost or gained by changes of
+        Of a body of degree 2 the faces are curved as its cells are, and all nodes touch (theory
+        19.6).
+
+        With smoothing, of degree 1, a slave touches a smooth surface through the nodes instead of
+        the flat or bilinear facets of a master. It is linear in the nodes, so momentum and energy
+        are kept as without. Over quadrilaterals lie bicubic patches of Overhauser's cubics (Catmull
+        and Rom 1974), over each triangle three quartic ones (Clough and Tocher 1965; Shirman and
+        Sequin 1987) whose tangent planes fit the rings of its nodes, of any number of neighbours.
+        The normal no longer jumps from facet to facet, and the energy lost or gained by changes of
         facet (`contact_defect`) falls: on a cylinder more than 1e4 times on even quadrilaterals, 20
         to 100 times where they differ by up to a half in size, 4e3 times and more on triangles,
         even or not. For smoothing in contact see Wriggers, Krstulovic-Opara and Korelc (2001) and
@@ -79,14 +82,19 @@ class MeshBody(Body):
 
         Raises:
             TypeError: smoothing is no bool.
-            ValueError: No mesh, degree above 1, no facet, or interior facets, or none that faces
-                `normal`; normal or angle is none, or normal is given alone; mass is unknown, or
-                "redistributed" of a rigid body; too little of the body is left beside the surface
-                to take its mass, or the body has moved already.
+            ValueError: No mesh, degree above 2, no facet, or interior facets, or none that faces
+                `normal`; normal or angle is none, or normal is given alone; smoothing of degree 2;
+                mass is unknown, or "redistributed" of a rigid body or of degree 2; too little of
+                the body is left beside the surface to take its mass, or the body has moved already.
         """
         require_bool("smoothing", smoothing)
         require_one_of("mass", mass, ("consistent", "redistributed"))
         self._check_surface(mass)
+        if smoothing and (self.degree or 1) > 1:
+            raise ValueError(
+                f"smoothing={smoothing!r} of a surface of {self.name!r}: its faces are curved "
+                f"themselves, of degree {self.degree}; leave smoothing out"
+            )
         what = f"marker of a surface of {self.name!r}"
         found = choose_facets(self.mesh, marker, tag, normal, angle, what)
         surface = Surface(self, skin_of_mesh(self, found), smoothing)

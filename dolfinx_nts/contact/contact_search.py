@@ -119,7 +119,12 @@ class ContactSearch:
         drop_doubles(found, [old.force for old in self._old])
         for k, (corners, of) in enumerate(self._corners, self._declared):
             meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=np.int64)
-            corners.leave_to(found[of].candidates.node, meet)
+            slaves = [
+                (pair.slave, c.candidates)
+                for pair, c in zip(self._pairs, found[: self._declared], strict=False)
+                if pair.slave.body is corners.master.body
+            ]
+            corners.leave_to(slaves, meet)
             near = self._search(k)
             if near is not None:
                 numbers.append(k)

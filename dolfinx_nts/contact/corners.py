@@ -16,16 +16,14 @@ from dolfinx_nts.contact.convex_edges import OUTSIDE
 from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.pair import Candidates, Found, Motion
-from dolfinx_nts.contact.rims import TILTED, facets_around
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.kernels import facets
-from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-#: A corner nearer to an edge of the slave than this part of a facet is the edges' where these meet.
-_AT_EDGE = 0.05
+#: What cannot enter a facet by this part of its size is outside.
+_OUTSIDE = 0.05
 
 
 class Corners(FacetPair):
@@ -44,10 +42,6 @@ class Corners(FacetPair):
             _with_corners(of), of.slave, friction=of.friction, interference=of.interference,
             adjust=of.adjust,
         )  # fmt: skip
-        self.leave_to(np.empty(0, dtype=np.int64), np.empty((0, 4), dtype=np.int64))
-        self._around = facets_around(self.slave)
-        self._rims = self._sharp_sides()
-        self._level = 1.0 - TILTED[self.yields] ** 2
 
     @property
     def sharp_edges(self) -> tuple[Edges, Edges]:  # type: ignore[override]
@@ -68,27 +62,36 @@ class Corners(FacetPair):
         """Sum of the forces that they bear [N]. Collective."""
         return float(global_sum(self.slave.body.comm, history.force.sum(keepdims=True))[0])
 
-    def leave_to(self, node: IntArray, meet: IntArray) -> None:
-        """Note what else holds in a step, before `find`.
+    def leave_to(self, nodes: Sequence[tuple[Surface, Candidates]], meet: IntArray) -> None:
+        """Note what else holds in a step, before `find`. Collective.
 
         Args:
-            node: Candidates of the pair among this rank's slaves, shape (n,).
+            nodes: Candidates among this rank's slaves of the contacts in which the body is a slave,
+                whatever their masters, with their surfaces.
             meet: Ends of edges that may meet, two points of the master and two of the slave,
                 shape (k, 4).
         """
-        self._nodes, self._meet = node, meet
-        self._near = np.zeros(len(self.master.points), dtype=bool)
+        at, self._meet = self.master.points, meet
+        # From all points of the body that is the slave to where they touch what may hold them.
+        self._ways, self._near = np.zeros((len(at), 3)), np.zeros(len(at), dtype=bool)
+        for surface, c in nodes:
+            ways = np.zeros((len(surface.share), 4))
+            ways[c.node, :3], ways[c.node, 3] = -c.gap[:, None] * c.normal, 1.0
+            ways, points = surface.at_all(ways), surface.points
+            if points is not at:
+                _, own, other = np.intersect1d(at, points, return_indices=True)
+                found, ways = ways[other], np.zeros((len(at), 4))
+                ways[own] = found
+            near = ways[:, 3] > 0.0
+            self._ways[near], self._near = ways[near, :3], self._near | near
 
     def _closest(
         self, slaves: FloatArray, corners: FloatArray, reach: float, current: IntArray
     ) -> search.Closest:
-        """As of `FacetPair`, but for those that lie flat on what holds them. Collective."""
-        near = np.zeros(len(self.master.share), dtype=bool)
-        near[self._nodes] = True
-        self._near = self.master.at_all(near)
+        """As of `FacetPair`, but for those that something else holds. Collective."""
         found = super()._closest(slaves, corners, reach, current)
         node = np.flatnonzero(found.facet >= 0)
-        found.facet[node[self._lie_flat(node, found.facet[node], slaves, corners)]] = -1
+        found.facet[node[self._held(node, found.facet[node], slaves, corners)]] = -1
         return found
 
     def find(
@@ -104,7 +107,8 @@ class Corners(FacetPair):
         c = found.candidates
         if not len(c.node):
             return found
-        held = self._held(c.node, c.facet, positions)
+        # Their ways may have led them to other facets.
+        held = self._held(c.node, c.facet, positions[0], positions[1][self.master.facets])
         # What they enter meanwhile does not throw them out.
         found.followed[c.node[held & (c.gap < -OUTSIDE * c.length)]] = False
         return found._replace(candidates=c.select(~held))
@@ -121,64 +125,18 @@ class Corners(FacetPair):
         """Do as `ContactPair`, but for those that something else holds."""
         hit = super().missed(positions, motions, path, reach, held, aimed)
         if hit is not None:
-            node = np.flatnonzero(hit >= 0)
-            hit[node[self._held(node, hit[node], positions)]] = -1
+            node, corners = np.flatnonzero(hit >= 0), positions[1][self.master.facets]
+            hit[node[self._held(node, hit[node], positions[0], corners)]] = -1
         return hit
 
-    def _held(self, node: IntArray, facet: IntArray, x: Sequence[FloatArray]) -> BoolArray:
-        """Which of this rank's corners over facets something else holds, shape (n,).
-
-        Args:
-            node: The corners, shape (n,).
-            facet: The facets, shape (n,).
-            x: Points of slave and master at t_n [m].
-        """
-        corners = x[1][self.master.facets]
-        held = self._lie_flat(node, facet, x[0], corners)
-        point, meet = self.slave.share[node], self._meet
-        one, k = np.nonzero((point[:, None, None] == meet[None, :, :2]).any(axis=2))
-        start, way = x[1][meet[k, 2]], x[1][meet[k, 3]] - x[1][meet[k, 2]]
-        off = x[0][point[one]] - start
-        part = _dot(off, way) / _dot(way, way)
-        off -= np.clip(part, 0.0, 1.0)[:, None] * way
-        beside = np.linalg.norm(off, axis=1) < _AT_EDGE * facets.size(corners[facet[one]])
-        held[one[beside]] = True
-        return held if self.slave.body.rigid else held | self._at_rim(point, facet, x)
-
-    def _at_rim(self, point: IntArray, facet: IntArray, x: Sequence[FloatArray]) -> BoolArray:
-        """Which corners are over a sharp edge of their facets, shape (n,); arguments as of `_held`.
-
-        Where the rims of two bodies lie on each other the slave's nodes hold one that deforms.
-        """
-        corners, found = x[1][self.master.facets[facet]], np.zeros(len(facet), dtype=bool)
-        normal = _areas(corners)
-        normal /= np.linalg.norm(normal, axis=1)[:, None]
-        for side in range(corners.shape[1]):
-            start, end = corners[:, side], corners[:, (side + 1) % corners.shape[1]]
-            off, way = x[0][point] - start, end - start
-            off -= _dot(off, normal)[:, None] * normal
-            off -= np.clip(_dot(off, way) / _dot(way, way), 0.0, 1.0)[:, None] * way
-            near = np.linalg.norm(off, axis=1) < _AT_EDGE * facets.size(corners)
-            found |= near & self._rims[facet, side]
-        return found
-
-    def _sharp_sides(self) -> BoolArray:
-        """Which sides of the master's facets are sharp edges of its body, shape (facets, nc)."""
-        edges, at = self.sharp_edges[1], self.master.points[self.master.facets]
-        sides = np.stack([at, np.roll(at, -1, axis=1)], axis=2)
-        count = 1 + max(int(edges.surface.points.max(initial=0)), int(at.max(initial=0)))
-        sharp, own = (
-            np.sort(a, axis=-1) @ [count, 1] for a in (edges.surface.points[edges.ends], sides)
-        )
-        return np.isin(own, sharp)
-
-    def _lie_flat(
+    def _held(
         self, node: IntArray, facet: IntArray, x: FloatArray, corners: FloatArray
     ) -> BoolArray:
-        """Whether facets around corners lie flat on those that they are over, shape (n,).
+        """Which of this rank's corners over facets something else holds, shape (n,).
 
-        As long as a node there is a candidate of the pair; of rigid bodies all have to be, as what
-        reaches over a rim tips about it. A body that deforms lies on its nodes before the rim.
+        Those that stay as good as outside while corners of their facets are where the slave's nodes
+        hold them, on what these may touch, or at edges that meet those of the corner, and the
+        others anywhere within a facet's size.
 
         Args:
             node: The corners, shape (n,).
@@ -186,32 +144,21 @@ class Corners(FacetPair):
             x: Points of the slave at t_n [m].
             corners: Corners of the master's facets [m].
         """
-        near = self._near[self.master.facets[facet]]
-        flat: BoolArray = near.all(axis=1) if self.slave.body.rigid else near.any(axis=1)
-        some = np.flatnonzero(flat)
-        if not some.size:
-            return flat
-        around, first, count = self._around
-        number = count[node[some]]
-        pair = np.repeat(np.arange(len(some)), number)
-        start = np.cumsum(number) - number
-        own = around[first[node[some]][pair] + np.arange(len(pair)) - start[pair]]
-        one, two = _areas(x[self.slave.facets[own]]), _areas(corners[facet[some]])[pair]
-        along, square = _dot(one, two), _dot(one, one) * _dot(two, two)
-        flat[some] = False
-        flat[some[pair[(along < 0.0) & (along**2 > self._level * square)]]] = True
-        return flat
-
-
-def _areas(corners: FloatArray) -> FloatArray:
-    """Twice the area vectors of facets (n, nc, 3) [m^2], shape (n, 3)."""
-    one, two = corners[:, 1:-1] - corners[:, :1], corners[:, 2:] - corners[:, :1]
-    return cross(one, two).sum(axis=1)
-
-
-def _dot(one: FloatArray, two: FloatArray) -> FloatArray:
-    product: FloatArray = np.einsum("ni,ni->n", one, two)
-    return product
+        if not len(node):
+            return np.zeros(0, dtype=bool)
+        point, at, corners = self.slave.share[node], self.master.facets[facet], corners[facet]
+        xi, _ = compiled.closest_point(x[point], corners)
+        weights, _, _ = facets.shape(xi, at.shape[1])
+        _, _, normal = facets.frame(corners, xi)
+        rise = np.einsum("ni,nki->nk", normal, corners + self._ways[at] - x[point][:, None])
+        rise /= facets.size(corners)[:, None]
+        depth = np.where(self._near[at], np.clip(rise, 0.0, 1.0), 1.0)
+        if len(self._meet):
+            own, k = np.nonzero((point[:, None, None] == self._meet[None, :, :2]).any(axis=2))
+            meets = (at[own][:, :, None] == self._meet[k, None, 2:]).any(axis=2)
+            np.minimum.at(depth, own, np.where(meets, 0.0, 1.0))
+        held: BoolArray = np.einsum("nk,nk->n", weights, depth) < _OUTSIDE
+        return held
 
 
 def corners_of(pair: Any) -> list[Corners]:

@@ -10,7 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.contact.skins import in_order, locate_facets, oriented_nodes
+from dolfinx_nts.contact.linear_facets import vertex_nodes
+from dolfinx_nts.contact.skins import in_order, locate_facets
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows
@@ -79,7 +80,7 @@ def _direction(mesh: Mesh, normal: Any, angle: Any) -> FloatArray | None:
 
 def _normals(mesh: Mesh, local: IntArray) -> tuple[IntArray, FloatArray]:
     """Input numbers of facets' corners, (m, nc), and normals (m, 3), the same bits on any rank."""
-    nodes = oriented_nodes(mesh, local)
+    nodes = vertex_nodes(mesh, local)
     ids = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[nodes]
     roll, _ = in_order(ids)
     corners = mesh.geometry.x[np.take_along_axis(nodes, roll, axis=1)]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.nodal_pressure import carried_areas
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.types import BoolArray, FloatArray
 
@@ -80,12 +81,13 @@ def drop_doubles(found: list[ContactElements], forces: Sequence[FloatArray]) -> 
 
 
 def areas(contacts: Sequence[ContactPair]) -> list[FloatArray]:
-    """Tributary area of each point of each slave [m^2], (points,), with that of later contacts."""
-    found = [c.slave.area.copy() for c in contacts]
+    """Area of the pressure at each slave's points [m^2], (points,), with that of later contacts."""
+    own = [carried_areas(c.slave) for c in contacts]
+    found = [area.copy() for area in own]
     for i, j, _ in _beside(contacts):
         one, two = contacts[i].slave, contacts[j].slave
         _, here, there = np.intersect1d(one.points, two.points, return_indices=True)
-        found[i][here] += two.area[there]
+        found[i][here] += own[j][there]
     return found
 
 

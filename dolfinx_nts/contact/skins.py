@@ -9,12 +9,12 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.faces import Faces
+from dolfinx_nts.contact.linear_facets import body_facets, node_numbers, node_places
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.types import FloatArray, IntArray, Marker
 from dolfinx_nts.validation import at_points, is_whole
-
-_CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
 
 def locate_facets(mesh: Mesh, marker: Marker, tag: int | None, what: str) -> IntArray:
@@ -92,6 +92,7 @@ class Skin(NamedTuple):
         rows: Of the points at nodes of the mesh that this rank owns, in order, those nodes'
             positions among the owned ones, shape (n,).
         material: The points as functions of the body's coordinates.
+        faces: Those of degree 2 that the facets are parts of; None: each is one itself.
     """
 
     points: IntArray
@@ -100,34 +101,41 @@ class Skin(NamedTuple):
     reference: FloatArray
     rows: IntArray
     material: Points
+    faces: Faces | None = None
 
 
 def skin_of_mesh(body: Any, local_facets: IntArray) -> Skin:
-    """Facets of a body's mesh, whose corners are nodes. Collective.
+    """Facets of a body's mesh, whose corners are nodes of the body. Collective.
 
     Args:
         body: The body.
         local_facets: This rank's owned facets.
     """
-    mesh, space = body.mesh, body.space
-    nodes = oriented_nodes(mesh, local_facets)
-    local = compat.node_blocks(mesh, space)[nodes]
-    index_map = space.dofmap.index_map
-    corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
-    # An empty rank's list would become an array of floats.
-    ids = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[nodes]
-    table = gather_rows(mesh.comm, np.stack([corners, ids], axis=-1))
-    x = gather_rows(mesh.comm, mesh.geometry.x[nodes])
+    mesh, index_map = body.mesh, body.space.dofmap.index_map
+    found = body_facets(body, local_facets)
+    local = found.corners
+    corners, whole = (
+        index_map.local_to_global(of.ravel().astype(np.int32)).reshape(of.shape)
+        for of in (local, found.nodes)
+    )
+    table = gather_rows(mesh.comm, np.stack([corners, node_numbers(body)[local]], axis=-1))
+    x = gather_rows(mesh.comm, node_places(body)[local])
     roll, order = in_order(table[..., 1])
     table = np.take_along_axis(table, roll[..., None], axis=1)[order]
     x = np.take_along_axis(x, roll[..., None], axis=1)[order]
-    points, at, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
-    reference = x.reshape(-1, 3)[at]
+    faces = None
+    if (body.degree or 1) > 1:
+        parts, at, nodes = (gather_rows(mesh.comm, a) for a in (found.parts, found.at, whole))
+        parts = np.take_along_axis(parts, roll, axis=1)[order]
+        faces = parts, np.take_along_axis(at, roll[..., None], axis=1)[order], nodes[order]
+    points, first, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
+    reference = x.reshape(-1, 3)[first]
     low, high = index_map.local_range
     rows = points[(points >= low) & (points < high)] - low
     return Skin(
-        points, inverse.reshape(table.shape[:2]), table[..., 1].ravel()[at], reference, rows,
+        points, inverse.reshape(table.shape[:2]), table[..., 1].ravel()[first], reference, rows,
         body.at_nodes(points, reference),
+        None if faces is None else Faces(*faces[:2], np.searchsorted(points, faces[2])),
     )  # fmt: skip
 
 
@@ -148,26 +156,9 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     Collective.
     """
     mesh = body.mesh
-    nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
+    blocks = body_facets(body, compat.exterior_facets(mesh)).corners
     moved = fem.Function(body.space)
     here = body.at_mesh(u)
     moved.x.array[: len(here)] = here
     moved.x.scatter_forward()
-    blocks = compat.node_blocks(mesh, body.space)[nodes]
-    return mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
-
-
-def oriented_nodes(mesh: Mesh, local_facets: IntArray) -> IntArray:
-    """Geometry nodes of facets, cyclic and counter-clockwise seen from outside the cell."""
-    nodes = compat.entities_to_geometry(mesh, 2, local_facets)
-    nodes = nodes[:, _CYCLIC[nodes.shape[1]]]
-    if not len(nodes):
-        return nodes
-    to_cell = mesh.topology.connectivity(2, 3)
-    cells = np.array([to_cell.links(f)[0] for f in local_facets], dtype=np.int32)
-    x, centre = mesh.geometry.x, mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]].mean(axis=1)
-    corner = x[nodes]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, -1] - corner[:, 0])
-    inward = np.einsum("ni,ni->n", normal, corner.mean(axis=1) - centre) < 0
-    nodes[inward] = nodes[inward][:, ::-1]
-    return nodes
+    return node_places(body)[blocks] + moved.x.array.reshape(-1, 3)[blocks]

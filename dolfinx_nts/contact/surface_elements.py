@@ -169,6 +169,8 @@ class SurfaceElements(ContactElements):
             for side, number in zip(positions, self.attachment.numbers, strict=True)
         )
         slave = np.einsum("nc,nci->ni", self.sums.shape, own)
+        other = self.attachment.other[self.sums.element]
+        master = self.pair.master.combine(master, other)
         return np.concatenate([slave[:, None], master], axis=1)
 
     def _gaps(self, x: FloatArray) -> FloatArray:
@@ -328,7 +330,11 @@ class SurfaceElements(ContactElements):
         """As of `ContactElements`."""
         own, master = (number[self.sums.element] for number in self.attachment.numbers)
         of_slave = np.einsum("nc,ni->nci", self.sums.shape, -part.coupling[:, 0])
-        return [(own, of_slave), (master, -part.coupling[:, 1:])]
+        of_master = -part.coupling[:, 1:]
+        if self.pair.master.weights is not None:
+            weights = self.pair.master.weights[self.attachment.other[self.sums.element]]
+            of_master = np.einsum("nkp,nki->npi", weights, of_master)
+        return [(own, of_slave), (master, of_master)]
 
 
 def surface_elements(

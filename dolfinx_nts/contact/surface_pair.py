@@ -63,14 +63,14 @@ class OverMaster(NamedTuple):
     Attributes:
         own: Facets of the slave, shape (n,).
         other: Facets of the master, shape (n,).
-        shape: Weights of the facets' corners, shape (n, corners).
+        shape: Weights of the nodes of the facets' faces, shape (n, nodes).
         xi: Their feet on the master's facets at t_n, shape (n, 2).
         normal: Outward normals of the master there, shape (n, 3).
         gap: g_q [m], shape (n,).
         length: Size of the master's facet [m], shape (n,).
         cut: As of `Sums`, shape (n, 2).
-        slot: Positions in the slave's `share` of the nodes at the corners, or -1, (n, corners).
-        part: w_q Phi_A, the reference area that these have there [m^2], shape (n, corners).
+        slot: Positions in the slave's `share` of those that are corners of the facet, or -1.
+        part: w_q Phi_A, the reference area that these have there [m^2], shape (n, nodes).
     """
 
     own: IntArray
@@ -112,7 +112,7 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
                 f'adjust={self.adjust!r}: what nodes miss their facets by is nothing that '
                 'integration="surface" takes its gaps at; leave one of them out'
             )
-        if self.master.weights is not None:
+        if self.master.smooth:
             raise ValueError(
                 f'integration="surface": the master, {self.master.body.name!r}, is smoothed, and '
                 "forces on smooth patches are those of no uniform pressure; leave smoothing out"
@@ -167,10 +167,11 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
             return self._none
         found = segments(own, other, pairs)
         facet, over = self._facets[found.own], found.other
-        corners = self.slave.facets[facet]
-        shape, slopes, _ = facets.shape(found.xi, corners.shape[1])
-        x = np.einsum("nc,nci->ni", shape, slaves[corners])
-        xi, converged, normal, gap = _measured(x, other[over])
+        corners, nodes = self.slave.facets[facet], self.slave.face_nodes[facet]
+        hats, slopes, _ = facets.shape(found.xi, corners.shape[1])
+        shape = self.slave.shape(facet, found.xi)
+        x = np.einsum("nc,nci->ni", shape, slaves[nodes])
+        xi, converged, normal, gap = self._measured(x, master, over)
         length = facets.size(other)[over]
         excess = facets.edge_excess(xi, other.shape[1])
         rim = self._free_edges[over]
@@ -178,7 +179,10 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         legal &= (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
         sides = np.matmul(slopes.transpose(0, 2, 1), self.slave.reference[corners])
         area = found.weight * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-        slot, part = self._position[corners], area[:, None] * shape
+        # A multiplier at each node of the face, though those of its other facets have no part.
+        own_nodes = nodes[:, :, None] == corners[:, None]
+        slot = np.where(own_nodes.any(axis=2), self._position[nodes], -1)
+        part = area[:, None] * np.einsum("nkc,nc->nk", own_nodes, hats)
         points = OverMaster(facet, over, shape, xi, normal, gap, length, xi, slot, part)
         return points.select(legal)
 
@@ -186,19 +190,29 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
     def _none(self) -> OverMaster:
         """No points."""
         number, flat = np.empty(0, dtype=np.int64), np.empty((0, 2))
-        shape = np.empty((0, self.slave.facets.shape[1]))
+        shape = np.empty((0, self.slave.face_nodes.shape[1]))
         return OverMaster(
             number, number, shape, flat, np.empty((0, 3)), np.empty(0), np.empty(0), flat,
             shape.astype(np.int64), shape,
         )  # fmt: skip
 
+    def _measured(
+        self, x: FloatArray, master: FloatArray, facet: IntArray
+    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+        """Feet of points (n, 3) on facets (n,), which were found, normals and gaps [m]."""
+        start, _ = compiled.closest_point(x, master[self.master.facets[facet]])
+        control = self.master.control_points(master, facet)
+        xi, converged = compiled.project(x, control, start)
+        foot, _, normal = facets.frame(control, xi)
+        gap: FloatArray = np.einsum("ni,ni->n", normal, x - foot)
+        return xi, converged, normal, gap
+
     def _seen_from(self, points: OverMaster, positions: Sequence[FloatArray]) -> OverMaster:
         """The same points and facets where they were at other positions."""
         slaves, master = positions
-        x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.facets[points.own]])
-        other = master[self.master.facets]
-        xi, converged, normal, gap = _measured(x, other[points.other])
-        length = facets.size(other)[points.other]
+        x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.face_nodes[points.own]])
+        xi, converged, normal, gap = self._measured(x, master, points.other)
+        length = facets.size(master[self.master.facets])[points.other]
         found = points._replace(xi=xi, normal=normal, gap=gap, length=length)
         return found.select(converged)
 
@@ -242,8 +256,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
             slave=self.slave, master=self.master, own=points.own[new], other=points.other[new]
         )
         slaves, master = positions
-        x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.facets[points.own]])
-        corners = master[self.master.facets[points.other]]
+        x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.face_nodes[points.own]])
+        corners = self.master.control_points(master, points.other)
         measure = FacetGap(
             start=np.concatenate([x[:, None], corners], axis=1), xi=points.xi,
             normal=points.normal, length=points.length, rule=step.integrator.contact_gradient,
@@ -287,14 +301,3 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         comm = self.slave.body.comm
         raise_together(comm, text, lambda told: StepFailedError(told, advises=True))
         return None
-
-
-def _measured(
-    x: FloatArray, corners: FloatArray
-) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-    """Feet of points (n, 3) on facets (n, nc, 3), which were found, normals and gaps [m]."""
-    start, _ = compiled.closest_point(x, corners)
-    xi, converged = compiled.project(x, corners, start)
-    foot, _, normal = facets.frame(corners, xi)
-    gap: FloatArray = np.einsum("ni,ni->n", normal, x - foot)
-    return xi, converged, normal, gap

@@ -35,13 +35,13 @@ class FacetAttachment(Batch):
 
     @property
     def numbers(self) -> tuple[IntArray, IntArray]:
-        """Their corners."""
-        return self.slave.facets[self.own], self.master.facets[self.other]
+        """The slave's nodes, and the points that the master's patches depend on."""
+        return self.slave.face_nodes[self.own], self.master.patches[self.other]
 
     @cached_property
     def sides(self) -> tuple[Points, Points]:
         """Nodes that these depend on."""
-        corners = self.slave.material.joined(self.slave.facets[self.own])
+        corners = self.slave.material.joined(self.slave.face_nodes[self.own])
         return corners, self.master.facet_nodes.select(self.other)
 
     @cached_property
@@ -50,7 +50,7 @@ class FacetAttachment(Batch):
         control, material = self.master.facet_weights, self.slave.material
         if material.are_nodes and control is None:
             return None
-        of_corners = material.weights[self.slave.facets[self.own]]
+        of_corners = material.weights[self.slave.face_nodes[self.own]]
         n, corners, nodes = of_corners.shape
         if control is None:
             width = self.master.facet_nodes.nodes.shape[1]
@@ -121,8 +121,11 @@ class Sums(Batch):
 
         Args:
             attachment: Facets of the elements.
-            foot: Weights of the corners of the master's facets in the points' feet.
+            foot: Weights of the control points of the master's facets in the points' feet.
         """
+        if attachment.master.weights is not None:
+            weights = attachment.master.weights[attachment.other[self.element]]
+            foot = np.einsum("nk,nkp->np", foot, weights)
         # Corners without a slave have one beyond the last.
         slave = np.where(self.slot < 0, self.slaves, self.slot)
         of_slaves = _sparse(self.share, slave, self.slaves + 1).T.tocsr()[: self.slaves]

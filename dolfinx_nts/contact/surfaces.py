@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.faces import Faces
 from dolfinx_nts.contact.skins import Skin
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import facets as facet_math
@@ -64,12 +65,14 @@ class Surface:
 
     Attributes:
         body: The body it belongs to.
-        points: As of `Skin`, and so are facets, original, reference, rows and material.
-        patches: Points that each patch depends on, the corners of its facet first: one patch a
-            facet, (m, nc), or with smoothing (m, 16) over quadrilaterals, and three over each
-            triangle, one after another, (3 m, q).
-        weights: With smoothing, the patches' control points from these points, shape (m, 16, 16) or
-            (3 m, 15, q); else None, as corners and control points are the same.
+        points: As of `Skin`, and so are facets, original, reference, rows, material and faces.
+        patches: Points that each patch depends on: one patch a facet, (m, nc), of degree 2 all
+            nodes of its face, (m, 9 or 6), or with smoothing (m, 16) over quadrilaterals, and three
+            over each triangle, one after another, (3 m, q), the corners of the facet first.
+        weights: With smoothing and of degree 2, the patches' control points from these points,
+            shape (m, 16, q), (m, 15, q) or (3 m, 15, q); else None, as corners and control points
+            are the same.
+        smooth: Whether slaves touch the smooth patches.
         area: Tributary area of each point [m^2], shape (p,).
         share: Positions in `points` of the nodes whose contact this rank computes, wherever their
             coordinates are: all ranks have as much to do, however the mesh is divided.
@@ -78,6 +81,8 @@ class Surface:
 
     #: For surfaces of one's own that do not call `__init__`.
     _touching: Touching | None = None
+    faces: Faces | None = None
+    smooth = False
     #: What a restart compares beside the facets.
     settings: Mapping[str, Any] = MappingProxyType({})
 
@@ -87,14 +92,17 @@ class Surface:
     ) -> None:
         self.body = body
         (
-            self.points, self.facets, self.original, self.reference, self.rows, self.material
+            self.points, self.facets, self.original, self.reference, self.rows, self.material,
+            self.faces,
         ) = skin  # fmt: skip
         x = self.reference[self.facets]
         self.area = facet_math.tributary_areas(self.facets, x, len(self.points))
-        self.patches: IntArray = self.facets
+        self.smooth, self.patches = smoothing, self.facets
         self.weights: FloatArray | None = None
         if smoothing:
             self._smooth(x)
+        elif self.faces is not None:
+            self.patches, self.weights = self.faces.nodes, self.faces.patches()
         self._touching = touching
         self.share = np.flatnonzero(_rank_of(self.original, body.comm.size) == body.comm.rank)
         free = ~self.material.fixed & (self.material.weights != 0.0)[:, :, None]
@@ -144,6 +152,17 @@ class Surface:
                 "surface of %r: %d of %d facets have a corner %s; there smoothing leaves edges",
                 self.body.name, irregular.sum(), len(irregular), where,
             )  # fmt: skip
+
+    @cached_property
+    def face_nodes(self) -> IntArray:
+        """Points that positions on each facet depend on, shape (m, k)."""
+        return self.facets if self.faces is None else self.faces.nodes
+
+    def shape(self, facet: IntArray, xi: FloatArray) -> FloatArray:
+        """Weights of `face_nodes` in points of facets (n,) at xi (n, 2), shape (n, k)."""
+        if self.faces is None:
+            return facet_math.shape(xi, self.facets.shape[1])[0]
+        return self.faces.shape(facet, xi)
 
     def patch_at(self, facet: IntArray, xi: FloatArray) -> IntArray:
         """Number in `patches` of what lies over facets (n,) at xi (n, 2), shape (n,)."""
@@ -215,8 +234,9 @@ class Surface:
 
     @cached_property
     def mass(self) -> FloatArray:
-        """Mass of the points' nodes [kg], shape (p,). Collective."""
-        return self.material.divided(self.body.nodal_mass)
+        """Mass of the points' nodes [kg], shape (p,), a measure of it > 0. Collective."""
+        # Rows of a tetrahedron of degree 2 have negative sums at its vertices.
+        return self.material.divided(np.abs(self.body.nodal_mass))
 
     @property
     def massless(self) -> npt.NDArray[np.bool_]:

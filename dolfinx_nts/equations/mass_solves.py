@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Body
@@ -50,7 +51,8 @@ class _Mass:
 
     def getDiagonal(self, _matrix: Any, diagonal: Any) -> None:  # noqa: N802 (PETSc's name)
         """What serves as the diagonal for preconditioning."""
-        diagonal.array_w[:] = self._body.nodal_mass
+        # Rows of a tetrahedron of degree 2 have negative sums at its vertices.
+        diagonal.array_w[:] = np.abs(self._body.nodal_mass)
 
 
 def solve_mass(body: Body, right: FloatArray) -> FloatArray:

@@ -60,7 +60,7 @@ class StepProblem:
         stabilization: In statics, what holds each node at t_n.
         lengths: Lengths of the scene, and of the step after `begin`.
         loads: When the step takes which loads.
-        is_awake: Whether each body is one of them, shape (bodies,).
+        is_awake: Whether each body is in the step, shape (bodies,).
         sleepers: Bodies that the step leaves out.
         supports: Prescribed coordinates in the step.
         batches: Which bodies it evaluates together.

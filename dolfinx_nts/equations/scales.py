@@ -45,7 +45,7 @@ class Lengths:
         ends = np.array([two for of in links for two in pairwise(of)], dtype=np.int64)
         a, b = ends.reshape(-1, 2).T
         graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(len(system.bodies),) * 2)
-        #: Of each body that of all that contacts and joints link to it.
+        #: Number of each body's group, which contacts and joints link.
         self._groups, self._group = connected_components(graph, directed=False)
 
     def begin(

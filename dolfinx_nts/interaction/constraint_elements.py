@@ -149,7 +149,7 @@ class ConstraintElements(PointElements):
 
     @property
     def entries(self) -> BoolArray:
-        """Those that coefficients which do not change with time let."""
+        """Those that can follow from coefficients which do not change with time."""
         if self.moves:
             return super().entries
         entries = kernel.pattern(*self.equations[:2])

@@ -133,7 +133,7 @@ class Elements(Protocol):
     def entries(self) -> BoolArray:
         """Which entries of a tangent can be non-zero, those of augmented unknowns left out.
 
-        Those that are not never are while the layout of a step's unknowns lasts; shape
+        An entry that is False stays zero as long as the layout of a step's unknowns is kept. Shape
         (k + m, k + m), of k coordinates and m constraints.
         """
 

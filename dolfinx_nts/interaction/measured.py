@@ -241,7 +241,7 @@ class MeasuredElements(PointElements):
         inner = (bend + gradient.mean[:, :, None] * slope[:, None]).reshape(n, *a.shape[1:] * 2)
         weights = measure.weights
         tangent[:, :size, :size] = factor * np.einsum(
-            "va,nviwj,wb->naibj", weights, inner, weights, optimize=True
+            "va,nviwj,wb->naibj", weights, inner, weights
         ).reshape(n, size, size)
         work = pull * np.einsum("nai,nai->n", along, du)
         if width > size and not self.step.integrator.inertia:

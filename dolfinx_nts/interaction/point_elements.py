@@ -60,7 +60,7 @@ class PointElements:
 
     @property
     def entries(self) -> BoolArray:
-        """All that `pattern` lets."""
+        """All but what `pattern` leaves out."""
         return entries_of(self.num_coordinates, self.pattern)
 
     @property

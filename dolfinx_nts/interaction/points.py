@@ -154,7 +154,7 @@ class Points:
 
 
 def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
-    """Points of a body with a Lagrange space on a mesh of degree 1. Collective.
+    """Points of a body with a Lagrange space on a mesh. Collective.
 
     Args:
         body: The body; it has `mesh`, `space`, `degree` and `fixed`.
@@ -206,7 +206,7 @@ def _cells_of(mesh: Mesh, x: FloatArray) -> tuple[IntArray, IntArray, FloatArray
     padding = float(_ON_CELL * sizes.max(initial=0.0) + rounding)
     near = compat.cells_near(mesh, x, padding)
     dim, cmap = mesh.topology.dim, compat.coordinate_map(mesh)
-    simplex = nodes.shape[1] == dim + 1
+    simplex = compat.cell_name(mesh) in ("triangle", "tetrahedron")
     which, held, inside = [], [], []
     for i, cells in enumerate(near):
         for c in cells:

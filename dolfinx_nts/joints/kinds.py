@@ -126,7 +126,8 @@ class Revolute(_WithAxis):
         angle: Function of time, the angle about n by which A turns relative to B [rad]; None: free.
             A step in which it changes by half a turn or more is cut, or the run stops.
         friction: `JointFriction`, or None.
-        limits: Smallest and largest angle from the start [rad], around 0; None: none.
+        limits: Smallest and largest angle from the start [rad], around 0, by which A turns relative
+            to B about n; None: none.
         motor: Torque [N m] on A of time, angle and its rate, such as a controller's; None: none.
             Its work is external work.
         name: In messages and files; default: kind and bodies.
@@ -186,7 +187,7 @@ class Revolute(_WithAxis):
 
 @known_options
 class Cylindrical(_WithAxis):
-    """B slides along A's axis and turns about it.
+    """A slides along B's axis and turns about it.
 
     Args:
         a: A rigid body, a beam or shell, which it takes at the node there, or None.
@@ -237,7 +238,7 @@ class Cylindrical(_WithAxis):
 
 @known_options
 class Prismatic(_WithAxis):
-    """B slides along A's axis without turning.
+    """A slides along B's axis without turning.
 
     Args:
         a: A rigid body, a beam or shell, which it takes at the node there, or None.
@@ -246,7 +247,8 @@ class Prismatic(_WithAxis):
         axis: n at the start, of any length.
         displacement: Function of time, that of A relative to B along n [m]; None: free.
         friction: `JointFriction`, or None.
-        limits: Smallest and largest way from the start [m], around 0; None: none.
+        limits: Smallest and largest way from the start [m], around 0, of A relative to B along n;
+            None: none. So if A is the ground, B moves the other way.
         motor: Force [N] on A of time, way and its rate, such as a controller's; None: none.
             Its work is external work.
         name: In messages and files; default: kind and bodies.

@@ -27,6 +27,8 @@ from dolfinx_nts.validation import (
 #: Torque [N m] or force [N] on a of time, angle or way, and its rate.
 Motor = Callable[[float, float, float], float]
 
+#: Angle [rad] of a cone, the least: its cosine hardly knows smaller ones.
+_NARROW = 5e-3
 #: Part of a measure or a rate by which a motor is asked for its slopes.
 _APART = float(np.finfo(float).eps) ** (1 / 3)
 
@@ -198,7 +200,7 @@ def cone_limit(joint: Any, given: Any) -> tuple[OnJoint, ...]:
         given: The direction at the start, of any length, and the angle [rad]; or None.
 
     Raises:
-        ValueError: It is no direction, or the angle is not between 0 and pi.
+        ValueError: It is no direction, or the angle is out of range.
     """
     if given is None:
         return ()
@@ -208,10 +210,11 @@ def cone_limit(joint: Any, given: Any) -> tuple[OnJoint, ...]:
         most = float(angle)
     except (TypeError, ValueError):
         axis, most = None, np.nan
-    if not 0.0 < most < np.pi:
+    if not _NARROW <= most <= np.pi - _NARROW:
         raise ValueError(
             f"cone={given!r} of {joint.name!r}: pass a direction and the largest angle from it, "
-            "between 0 and pi [rad], e.g. ((0, 0, 1), 0.5)"
+            f"{_NARROW} rad at least and pi - {_NARROW} at most, e.g. ((0, 0, 1), 0.5); a "
+            "Revolute or Universal joint holds the direction itself"
         )
     (a,), (b,) = joint.directions(direction(f"cone of {joint.name!r}", axis)[None])
     law = Limits(joint.length * float(np.cos(most)), np.inf)

@@ -43,6 +43,8 @@ _ROW, _COLUMN = (
     )
     + 3
 ).T // 2
+#: Where control points are whose patch is as even as a facet, shape (16, 2).
+PLACES = np.stack([2.0 * _ROW - 3.0, 2.0 * _COLUMN - 3.0], axis=1)
 
 
 def _cubics(s: FloatArray) -> FloatArray:

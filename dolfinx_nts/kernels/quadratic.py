@@ -69,7 +69,6 @@ def pattern(weights: FloatArray, constants: FloatArray) -> BoolArray:
     return np.block([[corner, gradients.T], [gradients, np.zeros((m, m), dtype=bool)]])
 
 
-
 class Elements(NamedTuple):
     """Elements that are free of stress in the reference; axis 0 = element.
 

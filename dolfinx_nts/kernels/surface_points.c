@@ -3,7 +3,7 @@
 
 #include "nts_element.h"
 
-enum { CORNERS = 4, ROWS = 3 * (CORNERS + CONTROL) };
+enum { CORNERS = 9, ROWS = 3 * (CORNERS + CONTROL) };
 
 /* The measure's points (n, nc + 1, 3) from corners of slave and master (elements, corners + nc, 3). */
 void points_of(int corners, int nc, long n, const long *element, const double *shape, const double *y, double *out)

@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.nodal_pressure import pressures
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -113,7 +114,7 @@ def at_nodes(
         if pair.slave.body is body:
             own = state.contacts[k]
             first = np.where(own.force > 0.0, own.force, -own.gap)
-            area = system.slave_areas[k][pair.slave.share]
+            area = system.slave_areas[k]
             press = own.force if loads is None else loads.pressing(k, own.force)
             for name, (elsewhere, values) in _of_slave(pair, own, press, area).items():
                 fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values, first)
@@ -146,11 +147,18 @@ def spread(
 def _of_slave(
     pair: ContactPair, own: ContactHistory, press: FloatArray, area: FloatArray
 ) -> dict[str, tuple[float, FloatArray]]:
-    """Name -> value elsewhere and values at this rank's slave nodes; of forces [N], areas [m^2]."""
+    """Name -> value elsewhere and values at this rank's slave nodes. Collective.
+
+    Args:
+        pair: The contact.
+        own: What it remembers.
+        press: Forces at this rank's slave nodes [N].
+        area: Of all points of the slave [m^2].
+    """
     gap, near = own.gap, np.isfinite(own.gap)
     fields = {
         "contact_force": (0.0, press),
-        "contact_pressure": (0.0, press / area),
+        "contact_pressure": (0.0, pressures(pair.slave, press, area)),
         "contact_gap": (np.nan, np.where(near, gap, np.nan)),
         "contact_status": (-1.0, np.where(own.force > 0, 2.0, near.astype(float)) + own.stick),
     }

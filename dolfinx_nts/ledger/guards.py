@@ -70,7 +70,7 @@ def check_momentum(
             local[9:12] += body.linear_momentum(body.inertia(free - v0))
             speed += np.abs(free)
         local[13:] += problem.supports.bend(k, terms.du)
-        local[7] += float(body.nodal_mass @ speed)
+        local[7] += float(np.abs(body.nodal_mass) @ speed)
         local[8] += float(terms.du @ terms.du)
     for batch, part in zip(problem.elements, step.parts, strict=True):
         # Of forces that cancel each other within a body only the rounding counts.

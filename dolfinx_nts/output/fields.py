@@ -19,6 +19,7 @@ import numpy as np
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.nodal_pressure import pressures
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.output.own_functions import Own, checked, of_body, require_meshes
 from dolfinx_nts.output.running import Cadence, Running
@@ -74,24 +75,27 @@ class _Series:
         self.body, self.index, self.contacts, self._functions = body, index, contacts, functions
         self.path = folder / _file_name(body.name)
         self._times = 0
-        blocks = compat.node_blocks(body.mesh, body.space)
+        table = compat.geometry_dofmap(body.mesh)
+        self._kind, self._corners = _CELLS[compat.cell_name(body.mesh)]
+        if table.shape[1:] == (3,) and len(self._corners) == 2:
+            self._kind, self._corners = _CURVED
+        # Of solids of degree 2 the corners, whose pressures are means of what is beside them.
+        table = table[:, : len(self._corners)]
+        blocks, corner = compat.node_blocks(body.mesh, body.space), np.unique(table)
         self._owned = body.space.dofmap.index_map.size_local
-        nodes = np.flatnonzero((blocks >= 0) & (blocks < self._owned))
+        nodes = corner[(blocks[corner] >= 0) & (blocks[corner] < self._owned)]
         self._nodes, self._blocks = nodes, blocks[nodes]
         original = np.asarray(body.mesh.geometry.input_global_indices)
         everywhere = gather_on_root(body.comm, original[nodes])
         numbers, self._order = np.unique(everywhere, return_index=True)
         self._points = self._nodal(body.space.tabulate_dof_coordinates()[: self._owned])
         owned = body.mesh.topology.index_map(body.mesh.topology.dim).size_local
-        cells = gather_on_root(body.comm, original[compat.geometry_dofmap(body.mesh)[:owned]])
+        cells = gather_on_root(body.comm, original[table[:owned]])
         order = gather_on_root(
             body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
         )
         self._cell_order = np.argsort(order)
         self._cells = np.searchsorted(numbers, cells[self._cell_order])
-        self._kind, self._corners = _CELLS[compat.cell_name(body.mesh)]
-        if self._cells.shape[1:] == (3,) and len(self._corners) == 2:
-            self._kind, self._corners = _CURVED
 
     def _nodal(self, values: FloatArray) -> FloatArray:
         """Values of owned blocks in the order of the file, on rank 0."""
@@ -162,7 +166,7 @@ class _Series:
         found = contact_fields.at_nodes(system, state, solution.contact_loads, self.body)
         for label, k in self.contacts.items():
             slave, mean = system.contacts[k].slave, stepper.mean_force(k)
-            pressure = mean / system.slave_areas[k][slave.share]
+            pressure = pressures(slave, mean, system.slave_areas[k])
             for name, values in (("force", mean), ("pressure", pressure)):
                 found[f"contact_{name}_mean_{label}"] = contact_fields.spread(
                     slave, 0.0, values, values

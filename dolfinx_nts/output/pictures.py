@@ -12,7 +12,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.solid.stress import von_mises
-from dolfinx_nts.contact.skins import oriented_nodes
+from dolfinx_nts.contact.linear_facets import body_facets, node_places
 from dolfinx_nts.output.plots import save_figure
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.types import FloatArray
@@ -158,17 +158,17 @@ def _coloured_facets(body: Any, colour: str) -> tuple[FloatArray, FloatArray]:
     if isinstance(body, DirectorBody):
         return _skin(body)
     mesh, local = body.mesh, compat.exterior_facets(body.mesh)
-    nodes = oriented_nodes(mesh, local)[:, [0, 1, 2, -1]]
-    blocks = compat.node_blocks(body.mesh, body.space)[nodes]
-    corners = mesh.geometry.x[nodes] + body.u.x.array.reshape(-1, 3)[blocks]
+    blocks = body_facets(body, local).corners[:, [0, 1, 2, -1]]
+    corners = node_places(body)[blocks] + body.u.x.array.reshape(-1, 3)[blocks]
     if colour == "speed":
         return corners, np.linalg.norm(body.v.x.array.reshape(-1, 3)[blocks], axis=-1)
-    stress = von_mises(body)
+    stress = von_mises(body, at="cells")
     to_cell = mesh.topology.connectivity(2, 3)
     cells = np.array([to_cell.links(f)[0] for f in local], dtype=np.int64)
     dofs = compat.cell_dofs(stress.function_space)
     value = stress.x.array[dofs[cells, 0]] if len(cells) else np.empty(0)
-    return corners, np.tile(value[:, None], 4)
+    of_facets = np.repeat(value, len(corners) // max(len(cells), 1))
+    return corners, np.tile(of_facets[:, None], 4)
 
 
 def _skin(body: DirectorBody) -> tuple[FloatArray, FloatArray]:

@@ -153,7 +153,7 @@ class LedgerCheck:
         """Warn if contact has brought energy, in this step or in all. Collective."""
         total = row["impact_restored"] - row["contact_defect"]
         gain = total - before["impact_restored"] + before["contact_defect"]
-        massless = -row["massless_defect"]
+        massless, kind = -row["massless_defect"], "energy from behind facets"
         if massless > _GAIN * self._largest + self._rounding:
             self._solution.warn(
                 "energy from massless nodes", row["time"], massless,
@@ -166,7 +166,14 @@ class LedgerCheck:
             "use a finer or smoother master, or a smaller, constant dt; where faces of the master "
             "meet at an inner edge, declare a contact for each"
         )
-        if gain > _GAIN * energy + self._rounding:
+        nodes = bool(self._solution.system.contacts)
+        who = f"{'nodes' if nodes else 'joints at their limits'} that touch or leave in mid step"
+        if not nodes and gain > _GAIN * energy + self._rounding:
+            kind, text = "energy from limits of joints", (
+                f"{who} bring an energy of {gain:.3g} into a scene of {before['energy']:.3g}; "
+                "use a smaller dt, in which nothing turns through a cone or past a limit"
+            )
+        elif gain > _GAIN * energy + self._rounding:
             where = balance.expelled(problem, step)
             text = (
                 f"nodes that start behind their facets bring an energy of {gain:.3g} into "
@@ -181,14 +188,12 @@ class LedgerCheck:
             # What a coefficient of restitution takes is asked for.
             asked, lost = row["impact_restored"] != 0.0, -total - massless
             if not asked and lost > _LOSS * self._largest + self._rounding:
-                nodes = bool(self._solution.system.contacts)
-                who = f"{'nodes' if nodes else 'joints at their limits'} that touch or leave"
                 self._solution.warn(
                     "energy lost to contact", row["time"], lost,
-                    f"{who} in mid step have taken an energy of {lost:.3g}, "
+                    f"{who} have taken an energy of {lost:.3g}, "
                     f"{self._part(lost):.2g} of the largest energy: how bodies rebound may "
                     "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
                     "and, where bodies are meshes, a finer one",
                 )  # fmt: skip
             return
-        self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)
+        self._solution.warn(kind, row["time"], gain, text, grave=True)

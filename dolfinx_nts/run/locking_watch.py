@@ -66,6 +66,8 @@ class LockingWatch:
         """Warn of what was seen until now, where the run ends. Collective."""
         if self._in_time and self._steps < _FIRST:
             return
+        # Those of a run that this one goes on from are of its first part.
+        solution.warnings.withdraw(self.KINDS)
         seen = self._is_due and self._in_time
         sums = (self._sums if seen else self._sums + self._now()).tolist()
         for body, (jumps, whole) in zip(self._bodies, sums, strict=True):

@@ -105,6 +105,10 @@ class RunWarnings(Mapping[str, RunWarning]):
             about,
         )
 
+    def withdraw(self, kinds: Iterable[str]) -> None:
+        """Forget warnings of some kinds, of which the run now says what holds for all of it."""
+        self._found = {key: w for key, w in self._found.items() if w.kind not in kinds}
+
     @property
     def grave(self) -> list[RunWarning]:
         """Warnings that may make the result wrong."""

@@ -76,6 +76,29 @@ def test_a_wave_is_no_locking():
     s.close()
 
 
+def test_what_a_run_says_is_of_all_its_steps(tmp_path):
+    """It goes on from one that ended in the midst of waves, and says what an unbroken run does."""
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (8.0, 1.0, 1.0)), (16, 2, 2), CellType.hexahedron)
+
+    def system():
+        body = nts.Continuum(
+            mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="bar",
+            velocity=lambda x: np.stack([0 * x[0], 0 * x[0], 0.1 * (x[0] < 0.6)]),
+        )  # fmt: skip
+        return nts.System([body])
+
+    path, rule = COMM.bcast(tmp_path) / "run.h5", nts.EnergyMomentum()
+    written = nts.Checkpoint(path, every=64)
+    first = nts.simulate(system(), rule, dt=1e-3, t_end=0.064, checkpoint=written)
+    whole = nts.simulate(system(), rule, dt=1e-3, t_end=0.3)
+    again = system()
+    second = nts.simulate(again, rule, dt=1e-3, t_end=0.3, start=nts.restart(path, again))
+    told = [run.warnings["locking"] for run in (first, whole, second)]
+    assert [one.count for one in told] == [1, 1, 1]
+    assert told[2].worst == pytest.approx(told[1].worst, rel=1e-9)
+    assert told[0].worst != pytest.approx(told[1].worst, rel=1e-3)
+
+
 def test_degree_2_is_sound():
     _, run = bar((20, 2, 2), 0.3, degree=2)
     assert not set(run.warnings) & {"locking", "one cell thick"}
@@ -118,3 +141,18 @@ def test_thin_whatever_way_it_is_turned(angle, sides, cells, thin):
     mesh.geometry.x[:] = mesh.geometry.x @ rotation(angle, (1.0, 2.0, 3.0)).T
     body = nts.Continuum(mesh, nts.NeoHookean(young=1.0, poisson=0.3), density=1.0)
     assert body.is_thin == thin
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("volume", ["full", "projected"])
+def test_a_rank_without_a_cell(volume):
+    """One cell: on 2 ranks one of them has none."""
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), (1, 1, 1), CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, volume=volume,
+        velocity=lambda x: np.array([x[1], 0.0 * x[0], 0.0 * x[0]]),
+    )  # fmt: skip
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-3, t_end=0.02)
+    assert run.status == "completed"
+    energy = run.balance["energy"]
+    assert np.abs(energy - energy[0]).max() < 1e-12 * energy[0]

@@ -282,7 +282,7 @@ def spoil(blocks, how):
     elif how == "overlapping surfaces":
         blocks.addPhysicalGroup(2, blocks.getEntitiesForPhysicalGroup(2, 3), 20)
     elif how == "degree":
-        blocks.mesh.setOrder(2)
+        blocks.mesh.setOrder(3)
     else:
         blocks.removePhysicalGroups([(3, 7), (3, 9)])
 
@@ -294,7 +294,7 @@ def spoil(blocks, how):
         ("unmeshed", "physical volume 'left' has no mesh; call gmsh.model.mesh.generate"),
         ("overlapping volumes", "overlap; a cell has one body"),
         ("overlapping surfaces", "physical surfaces 'interface' and 20 overlap"),
-        ("degree", "'left' holds 'Hexahedron 27'.*of degree 1 .*setOrder"),
+        ("degree", "'left' holds 'Hexahedron 64'.*of degree 1 or 2.*setOrder"),
         ("no volumes", "no physical volume in this model.*addPhysicalGroup"),
     ],
 )

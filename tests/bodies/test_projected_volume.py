@@ -207,7 +207,7 @@ def test_stress_balances_a_load():
         traction=[nts.Traction(lambda x: x[2] > 1 - 1e-9, (0.0, 0.0, -1e2))],
     )  # fmt: skip
     assert nts.equilibrium(nts.System([body])).status == "completed"
-    stress = nts.cauchy_stress(body).x.array.reshape(-1, 3, 3)[:, 2, 2]
+    stress = nts.cauchy_stress(body, at="cells").x.array.reshape(-1, 3, 3)[:, 2, 2]
     # Layers of nine cells each, of equal volume.
     local = np.array([stress.sum(), len(stress)])
     total, count = COMM.allreduce(local)

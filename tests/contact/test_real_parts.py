@@ -1,69 +1,14 @@
 """Parts of Gmsh's tetrahedra that hook into each other; an independent twin looks for overlap."""
 
-from mpi4py import MPI
-
-import gmsh
 import numpy as np
 import pytest
+from gmsh_parts import deepest, of_gmsh
 from scenes import everywhere
-from scipy.spatial import cKDTree
-from solids import distances
 
 import dolfinx_nts as nts
 
-COMM = MPI.COMM_WORLD
 #: Radii of the hooks and of their wire [mm].
 RADIUS, THICK = 10.0, 3.0
-#: Faces of a tetrahedron.
-FACES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))
-
-
-def of_gmsh(draw, size):
-    """What `draw(occ)` returns, of tetrahedra of a size [mm]."""
-    gmsh.initialize()
-    gmsh.option.setNumber("General.Verbosity", 1)
-    out = draw(gmsh.model.occ)
-    gmsh.model.occ.synchronize()
-    group = gmsh.model.addPhysicalGroup(3, [tag for _, tag in out])
-    gmsh.model.setPhysicalName(3, group, "part")
-    for bound in ("Max", "Min"):
-        gmsh.option.setNumber(f"Mesh.MeshSize{bound}", size)
-    gmsh.model.mesh.generate(3)
-    part = nts.bodies_from_gmsh(gmsh.model, COMM)["part"]
-    gmsh.finalize()
-    return part
-
-
-def tetrahedra(body):
-    """Nodes now and cells of a body of degree 1, on one rank."""
-    space = body.u.function_space
-    cells = space.dofmap.list
-    cells = np.array(getattr(cells, "array", cells)).reshape(-1, 4)
-    return space.tabulate_dof_coordinates() + body.u.x.array.reshape(-1, 3), cells
-
-
-def deepest(body, other):
-    """Depth of the deepest node of a body in another one, over the other's mean edge."""
-    (points, _), (x, cells) = tetrahedra(body), tetrahedra(other)
-    corners = x[cells]
-    edges = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2)
-    tree = cKDTree(corners.mean(axis=1))
-    found = tree.query_ball_point(points, edges.max())
-    near = [(i, k) for i, cells_near in enumerate(found) for k in cells_near]
-    if not near:
-        return 0.0
-    node, cell = np.array(near).T
-    ways = (corners[cell, 1:] - corners[cell, :1]).transpose(0, 2, 1)
-    weights = np.linalg.solve(ways, (points[node] - corners[cell, 0])[:, :, None])[:, :, 0]
-    weights = np.column_stack([1.0 - weights.sum(axis=1), weights])
-    inside = np.unique(node[(weights > 1e-9).all(axis=1)])
-    if not inside.size:
-        return 0.0
-    faces, number = np.unique(
-        np.sort(np.concatenate([cells[:, f] for f in FACES]), axis=1), axis=0, return_counts=True
-    )
-    skin = x[faces[number == 1]]
-    return max(distances(points[[i]], skin).min() for i in inside) / edges.mean()
 
 
 def hook(turned):

@@ -207,13 +207,17 @@ def handed(integration, swap):
 
 @pytest.mark.slow
 def test_either_side_may_be_the_slave():
-    """Of 2000 kg m/s the first block keeps -39.6 or -39.1; of nodes against facets -33 or -308."""
+    """Of 2000 kg m/s the first block keeps the same part whichever is the slave, and the energy.
+
+    Of nodes against facets the coarse slave errs by little more than a per cent of the momentum.
+    """
     fine, coarse = (handed("surface", swap) for swap in (False, True))
     assert abs(fine[0] - coarse[0]) < 1.0
     # Theory section 17.5.
     assert abs(fine[1] - 0.0498) < 5e-5 and abs(coarse[1] - 0.0490) < 5e-5
     one, two = (handed("nodes", swap) for swap in (False, True))
-    assert abs(one[0] - two[0]) > 200.0
+    # Without corners of the master, which hold where the slave is the coarse one, -308.
+    assert max(abs(left - fine[0]) for left, _ in (one, two)) < 30.0
 
 
 @pytest.mark.mpi

@@ -49,7 +49,10 @@ def test_a_material_that_is_not_defined_is_named():
 def test_energy_that_contact_brings_in_small_parts_is_told():
     """No step of ten wins 1 % of the energy, all of them together 5 %."""
     told = []
-    solution = SimpleNamespace(warn=lambda kind, *rest, **_: told.append((kind, *rest)))
+    solution = SimpleNamespace(
+        warn=lambda kind, *rest, **_: told.append((kind, *rest)),
+        system=SimpleNamespace(contacts=["a contact"]),
+    )
     stepper = nts.Stepper(nts.System([Sprung(1.0)]), nts.EnergyMomentum())
     stepper.problem.begin(stepper.state, 0.05)
     step = stepper.solver.solve()
@@ -239,11 +242,15 @@ class Driven(PointMass):
 
 
 @pytest.mark.mpi
-def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
-    """0.1 J of 1 J, beside a mass of 2e6 kg at 1 m/s."""
+@pytest.mark.parametrize("contacts", [["a contact"], []])
+def test_a_gain_in_one_step_is_measured_without_driven_bodies(contacts, monkeypatch):
+    """0.1 J of 1 J, beside a mass of 2e6 kg at 1 m/s, of contacts or of limits of joints."""
     monkeypatch.setattr("dolfinx_nts.ledger.balance.expelled", lambda *_: "by one node")
     told = []
-    solution = SimpleNamespace(warn=lambda kind, *rest, **_: told.append((kind, *rest)))
+    solution = SimpleNamespace(
+        warn=lambda kind, *rest, **_: told.append((kind, *rest)),
+        system=SimpleNamespace(contacts=contacts),
+    )
     stepper = nts.Stepper(nts.System([Sprung(1.0), Driven(2e6, 1.0)]), nts.EnergyMomentum())
     stepper.problem.begin(stepper.state, 0.05)
     step = stepper.solver.solve()
@@ -253,8 +260,10 @@ def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
     promises.hold(stepper.problem, step, *solution.rows, 0.0)
     stepper.close()
     ((kind, _, size, text),) = told
-    assert kind == "energy from behind facets" and size == 0.1
-    assert text.startswith("nodes that start behind their facets bring an energy of 0.1 ")
+    kinds = {True: "energy from behind facets", False: "energy from limits of joints"}
+    assert kind == kinds[bool(contacts)] and size == 0.1
+    assert text.startswith("nodes that start behind" if contacts else "joints at their limits")
+    assert " an energy of 0.1 " in text
 
 
 def impact_on_a_heavy_plate(along):

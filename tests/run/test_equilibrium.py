@@ -469,7 +469,8 @@ def test_passing_by_a_facet_is_noticed(integration):
     # Slaves may reach over an edge of their facets, not through one.
     assert max(d.max() for d in system.penetration(run.state)) < 0.01
     assert abs(run.contact_forces[-1, 0, 2] / 3e4 - 1) < 1e-11
-    assert run.balance["active"][-1] == 16
+    # Of the master's rim, which lies on the slave's, some corners may carry, too.
+    assert run.balance["active"][-1] >= 16
 
 
 # ---- start of a dynamic run

@@ -15,10 +15,16 @@ import numpy as np
 
 from dolfinx_nts.types import FloatArray, IntArray
 
-#: Gmsh element type -> cell name, DOLFINx vertex k = Gmsh vertex order[k].
-_GMSH_CELLS = {4: ("tetrahedron", [0, 1, 2, 3]), 5: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-#: Gmsh element types of facets -> their corners.
-_GMSH_FACETS = {2: 3, 3: 4}
+_BRICK = [0, 1, 3, 2, 4, 5, 7, 6]
+#: Gmsh element type -> cell name, DOLFINx node k = Gmsh node order[k]; of degree 1, then 2.
+_GMSH_CELLS = {
+    4: ("tetrahedron", [0, 1, 2, 3]),
+    5: ("hexahedron", _BRICK),
+    11: ("tetrahedron", [0, 1, 2, 3, 8, 9, 5, 7, 6, 4]),
+    12: ("hexahedron", [*_BRICK, 8, 9, 10, 11, 12, 13, 15, 14, *range(16, 27)]),
+}
+#: Gmsh element types of facets -> their corners, which come first.
+_GMSH_FACETS = {2: 3, 3: 4, 9: 3, 10: 4}
 
 
 class Volume(NamedTuple):
@@ -27,8 +33,8 @@ class Volume(NamedTuple):
     Attributes:
         name: Its name.
         kind: DOLFINx cell name.
-        cells: Input node numbers in DOLFINx order, shape (m, corners).
-        facets: Tagged facets by input node numbers, any order, shape (k, facet corners).
+        cells: Input node numbers in DOLFINx order, shape (m, nodes).
+        facets: Tagged facets by numbers of their corners, any order, shape (k, facet corners).
         tags: Tags of the facets, shape (k,).
         regions: Tags of the cells, shape (m,).
         names: Names of some of these.
@@ -167,7 +173,8 @@ def _read_volume(
         kinds = [model.mesh.getElementProperties(kind)[0] for kind in elements]
         raise ValueError(
             f"file_or_model: physical volume {name!r} holds {listed(kinds)}; it must be meshed "
-            "with hexahedra or with tetrahedra only, of degree 1 (gmsh.model.mesh.setOrder(1))"
+            "with hexahedra or with tetrahedra only, of degree 1 or 2, hexahedra with 27 nodes "
+            "(gmsh.model.mesh.setOrder)"
         )
     ((number, cells),) = elements.items()
     kind, order = _GMSH_CELLS[number]
@@ -183,8 +190,9 @@ def _read_surfaces(
     """Names of the physical surfaces, and their facets and tags by number of corners."""
     surfaces: dict[str, int] = {}
     owner: dict[int, int] = {}
-    facets = {n: [np.empty((0, n), np.int64)] for n in _GMSH_FACETS.values()}
-    tags = {n: [np.empty(0, np.int32)] for n in _GMSH_FACETS.values()}
+    corners = set(_GMSH_FACETS.values())
+    facets = {n: [np.empty((0, n), np.int64)] for n in corners}
+    tags = {n: [np.empty(0, np.int32)] for n in corners}
     for _, tag in model.getPhysicalGroups(2):
         name = model.getPhysicalName(2, tag)
         if name:
@@ -199,7 +207,7 @@ def _read_surfaces(
                 )
         for kind, table in _elements(model, 2, tag).items():
             if kind in _GMSH_FACETS:
-                facets[_GMSH_FACETS[kind]].append(table)
+                facets[_GMSH_FACETS[kind]].append(table[:, : _GMSH_FACETS[kind]])
                 tags[_GMSH_FACETS[kind]].append(np.full(len(table), tag, np.int32))
     join = {n: np.concatenate(tables) for n, tables in facets.items()}
     return surfaces, join, {n: np.concatenate(values) for n, values in tags.items()}

@@ -6,6 +6,7 @@ import zlib
 
 from mpi4py import MPI
 
+import basix
 import numpy as np
 import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
@@ -14,7 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.contact.skins import oriented_nodes
+from dolfinx_nts.contact.linear_facets import vertex_nodes
 from dolfinx_nts.contact.surfaces import flux
 from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.types import FloatArray, IntArray
@@ -23,6 +24,8 @@ HashArray = npt.NDArray[np.uint64]
 
 #: Corners of the cells of each kind.
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
+#: Nodes of the cells of degree 2 of each kind that bodies may have.
+NODES = {"interval": 3, "tetrahedron": 10, "hexahedron": 27}
 #: Corner -> its three edge neighbours in DOLFINx vertex order.
 _NEIGHBOURS = np.array([[c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
 #: The triple product flips sign at every second corner.
@@ -38,8 +41,11 @@ def places_of(mesh: Mesh) -> int:
     return zlib.crc32(np.ascontiguousarray(mesh.geometry.x).tobytes())
 
 
-def check_mesh(mesh: Mesh, name: str) -> None:
-    """Raise on every rank unless the mesh is a valid 3D mesh of degree 1.
+def check_mesh(mesh: Mesh, name: str) -> int:
+    """Raise on every rank unless the mesh is a valid 3D mesh.
+
+    Returns:
+        Its degree, 1 or 2, on every rank.
 
     Raises:
         TypeError: It is no mesh.
@@ -59,27 +65,31 @@ def check_mesh(mesh: Mesh, name: str) -> None:
             f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra"
             f"{remedy}"
         )
-    _check_nodes(mesh, name)
-    cells = compat.geometry_dofmap(mesh)
-    owned = mesh.topology.index_map(3).size_local
-    _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, _CORNERS[kind])])
+    degree = _check_nodes(mesh, name, 2)
+    cells = compat.geometry_dofmap(mesh)[: mesh.topology.index_map(3).size_local]
+    _check_cells(mesh, name, mesh.geometry.x[cells[:, : _CORNERS[kind]]])
+    if degree > 1:
+        _check_curved(mesh, name, mesh.geometry.x[cells])
+    return degree
 
 
-def check_any_mesh(mesh: Mesh, name: str, degree: int = 1) -> None:
-    """Raise on every rank unless the mesh is valid and of degree 1, of any dimension.
+def check_any_mesh(mesh: Mesh, name: str, degree: int = 1) -> int:
+    """Raise on every rank unless the mesh is valid, of any dimension.
 
     Args:
         mesh: DOLFINx mesh.
         name: Of its body, for messages.
-        degree: Largest one of a mesh of intervals, 1 or 2.
+        degree: Largest one that it may have, 1 or 2; that of a mesh of surfaces is 1.
+
+    Returns:
+        The degree it has, on every rank.
 
     Raises:
         ValueError: Cells of another kind, not finite; in 3D inverted or overlapping.
     """
     if mesh.topology.dim == 3:
-        check_mesh(mesh, name)
-    else:
-        _check_nodes(mesh, name, degree)
+        return check_mesh(mesh, name)
+    return _check_nodes(mesh, name, degree)
 
 
 def refuse_repeated(mesh: Mesh, name: str) -> None:
@@ -152,22 +162,31 @@ def _hashed(a: HashArray) -> HashArray:
     return a ^ (a >> np.uint64(31))
 
 
-def _check_nodes(mesh: Mesh, name: str, degree: int = 1) -> None:
-    """Raise on every rank unless the nodes are corners of known cells, and finite."""
+def _check_nodes(mesh: Mesh, name: str, degree: int = 1) -> int:
+    """Raise on every rank unless the nodes are those of known cells, and finite.
+
+    Returns:
+        Degree of the cells.
+    """
     kind, cells = compat.cell_name(mesh), compat.geometry_dofmap(mesh)
     if kind not in _CORNERS:
         raise ValueError(f"mesh of {name!r}: {kind}; pass a mesh of {', '.join(_CORNERS)}")
     corners = _CORNERS[kind]
     nodes = mesh.comm.allreduce(cells.shape[1], op=MPI.MAX)
-    if not corners <= nodes < corners + degree:
+    known, of_degree = [corners], "1"
+    if degree > 1 and kind in NODES:
+        known, of_degree = [corners, NODES[kind]], "1 or 2"
+    if nodes not in known:
         raise ValueError(
-            f"mesh of {name!r}: {nodes} nodes per {kind}, not {corners}; pass a mesh of degree 1, "
-            "e.g. nts.linear(mesh), which keeps its corners, or mesh with order 1 in Gmsh"
+            f"mesh of {name!r}: {nodes} nodes per {kind}, not {' or '.join(map(str, known))}; pass "
+            f"a mesh of degree {of_degree}, e.g. nts.linear(mesh), which keeps its corners, or "
+            "mesh with this order in Gmsh"
         )
     nan = np.flatnonzero(~np.isfinite(mesh.geometry.x).all(axis=1))
     text = f"mesh of {name!r}: {len(nan)} nodes are not finite, e.g. {mesh.geometry.x[nan[:1]]}"
     raise_together(mesh.comm, f"{text}; check the coordinates for NaN" if len(nan) else None)
     refuse_repeated(mesh, f"mesh of {name!r}")
+    return 1 + known.index(nodes)
 
 
 def _check_cells(mesh: Mesh, name: str, x: FloatArray) -> None:
@@ -190,7 +209,7 @@ def _check_cells(mesh: Mesh, name: str, x: FloatArray) -> None:
     # Seen from a point of the mesh: from a far origin the cones over its boundary would cancel.
     corner = np.append(mesh.geometry.x, np.full((1, 3), np.inf), axis=0).min(axis=0)
     mesh.comm.Allreduce(MPI.IN_PLACE, corner, op=MPI.MIN)
-    boundary = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))] - corner
+    boundary = mesh.geometry.x[vertex_nodes(mesh, compat.exterior_facets(mesh))] - corner
     local = np.array([np.abs(volumes).sum(), flux(boundary).sum()])
     volume, enclosed = mesh.comm.allreduce(local)
     if abs(volume - enclosed) > 1e-9 * volume:
@@ -198,3 +217,19 @@ def _check_cells(mesh: Mesh, name: str, x: FloatArray) -> None:
             f"mesh of {name!r}: inverted or overlapping cells, whose volumes add up to "
             f"{volume:.12g} while the boundary encloses {enclosed:.12g}; repair the mesh"
         )
+
+
+def _check_curved(mesh: Mesh, name: str, x: FloatArray) -> None:
+    """Raise on every rank if one of the cells with nodes x (n, 10 or 27, 3) is folded."""
+    kind = getattr(basix.CellType, compat.cell_name(mesh))
+    variant = basix.LagrangeVariant.gll_warped
+    element = basix.create_element(basix.ElementFamily.P, kind, 2, variant)
+    slopes = element.tabulate(1, element.points)[1:, :, :, 0]
+    det = np.linalg.det(np.einsum("dpk,nki->npdi", slopes, x))
+    bad = np.flatnonzero(np.abs(np.sign(det).sum(axis=1)) < det.shape[1])
+    where = f"e.g. the one at x={x[bad[:1]].mean(axis=(0, 1)).tolist()}" if len(bad) else ""
+    text = (
+        f"mesh of {name!r}: {len(bad)} curved cells are folded, {where}; repair the mesh, with "
+        "Gmsh's option Mesh.HighOrderOptimize, or pass nts.linear(mesh)"
+    )
+    raise_together(mesh.comm, text if len(bad) else None)

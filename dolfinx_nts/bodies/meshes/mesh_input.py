@@ -26,6 +26,7 @@ from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.meshes.gmsh_input import Input, Volume, listed, read_gmsh
+from dolfinx_nts.bodies.meshes.mesh_check import NODES
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.solid.continuum import Continuum
 from dolfinx_nts.bodies.solid.parameters import Parameter
@@ -42,7 +43,7 @@ class Part:
 
     Attributes:
         name: Name of the volume.
-        mesh: dolfinx mesh of degree 1.
+        mesh: dolfinx mesh, of degree 2 if the input is.
         facet_tags: dolfinx meshtags of its tagged facets, interior ones included.
         surfaces: Name of a surface -> its tag, for the named surfaces of the input that this body
             has facets of.
@@ -166,7 +167,8 @@ def bodies_from_gmsh(
         ImportError: There is no Gmsh on rank 0.
         TypeError: `comm` is no communicator, or `bodies` no dict of sequences.
         ValueError: `bodies` names an unknown volume, or one twice; no such file or no physical
-            volume; a volume is not all hexahedra or all tetrahedra of degree 1, or has no mesh;
+            volume; a volume is not all hexahedra or all tetrahedra of one degree, 1 or 2, or has
+            no mesh;
             physical groups overlap. Raised on every rank.
     """
     if not isinstance(comm, MPI.Comm):
@@ -193,7 +195,7 @@ def bodies_from_tags(
     """One mesh per cell tag of a DOLFINx mesh.
 
     Args:
-        mesh: 3D hexahedral or tetrahedral mesh of degree 1.
+        mesh: 3D hexahedral or tetrahedral mesh of degree 1 or 2.
         cell_tags: dolfinx meshtags; each value is a body, cells without one belong to none.
         facet_tags: dolfinx meshtags of facets; a facet between two bodies becomes one of each.
         names: Name of a body -> its cell tag, or several, which its cells keep, see
@@ -252,11 +254,11 @@ def _united(data: Input, bodies: Mapping[str, Sequence[str]]) -> Input:
                     f"are {listed(left)}"
                 )
             parts.append(left.pop(name))
-        kinds = {part.kind for part in parts}
+        kinds = {(part.kind, part.cells.shape[1]) for part in parts}
         if len(kinds) != 1:
             raise ValueError(
                 f"bodies[{body!r}]={list(names)!r}: has cells of {len(kinds)} kinds; pass volumes "
-                "of hexahedra only, or of tetrahedra only"
+                "of hexahedra only, or of tetrahedra only, all of one degree"
             )
         cells, regions = (
             np.concatenate([getattr(p, which) for p in parts]) for which in ("cells", "regions")
@@ -287,11 +289,10 @@ def _body(data: Input, index: int) -> tuple[Any, ...]:
 
 def _part(comm: MPI.Comm, name: str, body: Any, surfaces: Mapping[str, int]) -> Part:
     """Mesh and tags of one body whose arrays rank 0 holds."""
-    shared = comm.bcast(None if body is None else (body[0], *body[3:]))
-    kind, facets, tags, regions, names = shared
-    if body is None:
-        cells, x = np.empty((0, _CORNERS[kind]), np.int64), np.empty((0, 3))
-    else:
+    shared = comm.bcast(None if body is None else (body[0], body[1].shape[1], *body[3:]))
+    kind, nodes, facets, tags, regions, names = shared
+    cells, x = np.empty((0, nodes), np.int64), np.empty((0, 3))
+    if body is not None:
         cells, x = body[1:3]
     mesh = compat.create_mesh(comm, cells, x, kind)
     mesh.topology.create_entities(2)
@@ -353,8 +354,8 @@ def _merge(
     tags, cells, x, values, facets = (_joined(tables) for tables in zip(*gathered, strict=True))
     if not len(tags):
         raise ValueError("cell_tags: no cell has a tag; tag the cells of each body")
-    if cells.shape[1] != _CORNERS[kind]:
-        raise ValueError("mesh: geometry of degree above 1; pass a mesh of degree 1")
+    if cells.shape[1] not in (_CORNERS[kind], NODES[kind]):
+        raise ValueError("mesh: geometry of degree above 2; pass a mesh of degree 1 or 2")
     # An order that does not depend on the ranks; a submesh does not know the original one.
     order = np.lexsort(cells.T)
     tags, cells, x = tags[order], cells[order], x[order]

@@ -83,12 +83,12 @@ def _not_rounding(euler: FloatArray) -> FloatArray:
     return np.where(euler > ROUNDED * euler.max(), euler, 0.0)
 
 
-def inertia_of(space: fem.FunctionSpace, density: Parameter) -> Inertia:
-    """That of a mesh with a function space of vectors on it. Collective."""
+def inertia_of(space: fem.FunctionSpace, density: Parameter, degree: int) -> Inertia:
+    """That of a mesh with a function space of vectors on it, both of a degree. Collective."""
     mesh = space.mesh
     rho = fem.Constant(mesh, float(density)) if is_number(density) else density
     v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
-    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4 if degree == 1 else 7})
     (form,) = compile_forms([rho * ufl.inner(v, w) * dx])
     matrix = petsc_compat.create_matrix(form)
     petsc_compat.assemble_matrix(matrix, form, (), 0.0)

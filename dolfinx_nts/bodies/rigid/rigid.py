@@ -100,20 +100,20 @@ class RigidBody(MeshBody):
         name: str = "rigid",
     ) -> None:
         require_name("name", name)
-        check_mesh(mesh, name)
+        degree = check_mesh(mesh, name)
         given = {
             "name": name, "velocity": velocity, "angular_velocity": angular_velocity,
             "force": force, "torque": torque, "motion": motion, "rotation": rotation,
         }  # fmt: skip
         require_same(mesh.comm, density=density if is_number(density) else None, **given)
         require_positive_parameter("density", density, "kg/m^3")
-        self.mesh, self.density, self.degree = mesh, density, 1
+        self.mesh, self.density, self.degree = mesh, density, degree
         self.made_on = places_of(mesh)
-        self.space = compat.vector_space(mesh, 1)
+        self.space = compat.vector_space(mesh, degree)
         self.u, self.v = motion_on(self.space, name)
         self._densities = [] if is_number(density) else [density]
         self._measured = self.parameters()
-        self._set_up(mesh.comm, inertia_of(self.space, density), **given)
+        self._set_up(mesh.comm, inertia_of(self.space, density, degree), **given)
 
     @classmethod
     @known_options

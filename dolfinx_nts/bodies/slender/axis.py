@@ -52,9 +52,7 @@ def check_line(mesh: Mesh, degree: Any, name: str) -> int:
         raise ValueError(
             f"mesh of {name!r}: {kind} in {dim}D; pass intervals with points of three coordinates"
         )
-    check_any_mesh(mesh, name, 2)
-    least = compat.geometry_dofmap(mesh).shape[1] - 1
-    least = mesh.comm.allreduce(least, op=MPI.MAX)
+    least = check_any_mesh(mesh, name, 2)
     if degree is None:
         return least
     if isinstance(degree, bool) or degree not in (1, 2):

@@ -33,7 +33,7 @@ class _Mean(NamedTuple):
     taken: Taken | None
 
 
-class _OfCells:
+class EntriesOfCells:
     """Entries of linear forms in each of this rank's cells.
 
     Args:
@@ -75,7 +75,7 @@ class CellMeans:
 
     def __init__(self, mesh: Mesh, dx: Any) -> None:
         self.dx, self.space = dx, compat.function_space(mesh, "DG", 0)
-        self.sums = _OfCells(self.space)
+        self.sums = EntriesOfCells(self.space)
         self.moving: list[int] = []
         self._means: list[_Mean] = []
         self._forms: list[CellForm] = []
@@ -182,7 +182,7 @@ class FormWithMeans:
         broken = compat.function_space(space.mesh, "DG", degree, (3,))
         apart, one = ufl.TestFunction(broken), fem.Function(means.space)
         one.x.array[:] = 1.0
-        self._apart = _OfCells(broken)
+        self._apart = EntriesOfCells(broken)
         nodes = compat.cell_dofs(space)[: self._apart.cells].astype(PETSc.IntType)
         coordinates = 3 * nodes[:, :, None] + np.arange(3, dtype=PETSc.IntType)
         self._dofs = coordinates.reshape(len(nodes), 3 * nodes.shape[1])

@@ -66,7 +66,8 @@ class Continuum(UflBody):
             it as its first guess, so that its ledger misses the energy stored in the guess.
         bcs: `Dirichlet` conditions, fixed or moving in time.
         name: Name in messages and files.
-        degree: Polynomial degree; contact surfaces need 1.
+        degree: Polynomial degree; contact surfaces need 1 or 2. Default: that of the mesh, whose
+            cells of degree 2 are curved.
         body_force: Force per reference volume [N/m^3], a vector or a function of time.
         traction: `Traction` loads.
         quadrature_degree: For energy, stress and loads; default 2 x 2 x 2 Gauss points on trilinear
@@ -108,7 +109,7 @@ class Continuum(UflBody):
         displacement: Values = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
         name: str = "body",
-        degree: int = 1,
+        degree: int | None = None,
         body_force: VectorInTime = (0.0, 0.0, 0.0),
         traction: Sequence[Traction] = (),
         quadrature_degree: int | None = None,
@@ -123,12 +124,17 @@ class Continuum(UflBody):
             )
         require_positive_parameter("density", density, "kg/m^3")
         for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
-            default = option == "quadrature_degree" and value is None
-            if not default and not (is_whole(value) and value > 0):
+            if value is not None and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
-        check_mesh(mesh, name)
+        least = check_mesh(mesh, name)
+        degree = degree or least
+        if degree < least:
+            raise ValueError(
+                f"degree={degree!r} of {name!r}: its mesh is of degree {least}; leave degree out, "
+                "or pass nts.linear(mesh)"
+            )
         require_one_of("volume", volume, ("full", "projected"))
         if volume == "projected" and (degree != 1 or compat.cell_name(mesh) != "hexahedron"):
             raise ValueError(
@@ -144,7 +150,8 @@ class Continuum(UflBody):
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
         self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
         self.body_force, self._traction = body_force, traction
-        self._of_mass = max(quadrature_degree, 2 * degree)
+        # A curved cell's volume is a polynomial, too.
+        self._of_mass = max(quadrature_degree, 2 * degree + 3 * (least - 1))
         self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
         self._ds = self._boundary_measure(quadrature_degree)
         changing = any(callable(value) for value, _ in self._loads_at(0.0))
@@ -262,7 +269,7 @@ class Continuum(UflBody):
     def remedy_of_locking(self) -> str:
         """As of `Body`."""
         if self._linear and compat.cell_name(self.mesh) == "tetrahedron":
-            return "use a finer mesh, hexahedra, or degree=2 if it touches nothing"
+            return "use degree=2, hexahedra, or a finer mesh"
         if self._linear and self._volume == "full":
             return "use volume='projected', or a finer mesh"
         return "use a finer mesh"

@@ -112,10 +112,16 @@ class FormBody(UflBody):
                 f"space={space!r}: pass a continuous Lagrange space of 3-vectors, e.g. of "
                 '("Lagrange", 1, (3,))'
             )
-        check_any_mesh(space.mesh, name)
+        least = check_any_mesh(space.mesh, name)
+        if degree < least:
+            raise ValueError(
+                f"space={space!r}: is of degree {degree}, and its mesh of degree {least}; pass one "
+                f"of degree {least}, or of nts.linear(mesh)"
+            )
         self._quadrature, self._given_mass = quadrature_degree or 2 * degree, mass
         # With one point a cell could turn for nothing.
-        self._of_mass = max(self._quadrature, 2 * degree)
+        # A curved cell's volume is a polynomial, too.
+        self._of_mass = max(self._quadrature, 2 * degree + 3 * (least - 1))
         super().__init__(space, degree, name, extra_form, self._quadrature, allow_inversion)
         self._rho = None if density is None else self._density(density)
         self.rounded = self._size()

@@ -52,7 +52,7 @@ class Determinants:
     As det(dx/dxi) / det(dX/dxi) it needs the nodes' positions alone.
 
     Args:
-        space: Continuous Lagrange space of the displacements on a mesh of degree 1.
+        space: Continuous Lagrange space of the displacements.
         degree: Its polynomial degree.
         quadrature_degree: That of the strain energy.
     """

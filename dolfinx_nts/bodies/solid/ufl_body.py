@@ -32,6 +32,7 @@ from dolfinx_nts.bodies.solid.parameters import (
     values_of,
 )
 from dolfinx_nts.bodies.solid.step_forms import StepForms, check_extra_form, fill
+from dolfinx_nts.contact.linear_facets import HIGHEST
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -118,10 +119,16 @@ class UflBody(MeshBody):
                 f"body {self.name!r}: contact surfaces are boundaries of 3D meshes, not of "
                 f"{compat.cell_name(self.mesh)}s"
             )
-        if self.degree != 1:
+        degree = int(self.degree or 1)
+        if degree > HIGHEST:
             raise ValueError(
-                f"degree={self.degree!r} of body {self.name!r}: surfaces, of contacts and of "
-                "ties, need degree 1; pass degree=1, on a finer mesh for the same accuracy"
+                f"degree={degree} of body {self.name!r}: surfaces, of contacts and of "
+                f"ties, need degree 1 or {HIGHEST}; pass degree={HIGHEST}"
+            )
+        if mass == "redistributed" and degree > 1:
+            raise ValueError(
+                f"mass={mass!r} of a surface of {self.name!r}: needs degree 1, as at nodes of "
+                f"degree {degree} the mass of some is negative; use mass='consistent'"
             )
 
     def _make_massless(self, surface: Surface) -> None:
