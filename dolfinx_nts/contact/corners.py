@@ -82,7 +82,9 @@ class Corners(FacetPair):
                 _, own, other = np.intersect1d(at, points, return_indices=True)
                 found, ways = ways[other], np.zeros((len(at), 4))
                 ways[own] = found
-            near = ways[:, 3] > 0.0
+            # What is nearest to a node holds it.
+            far = np.square(self._ways).sum(axis=1) > np.square(ways[:, :3]).sum(axis=1)
+            near = (ways[:, 3] > 0.0) & (far | ~self._near)
             self._ways[near], self._near = ways[near, :3], self._near | near
 
     def _closest(

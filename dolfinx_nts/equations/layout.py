@@ -68,7 +68,9 @@ class ElementBlocks(NamedTuple):
         columns: Columns of each part in the element's unknowns; one of a constraint with several
             multipliers occurs as often.
         numbers: Numbers in the field, shape (n, columns); negative ones are left out.
-        pattern: Which entries of an element's tangent can be non-zero, shape (r, r).
+        pattern: Which entries of a tangent are in a matrix, shape (r, r): all that couple
+            coordinates of bodies with anything.
+        entries: Which of them can be non-zero, see `Elements.entries`.
         weights: Of the multipliers, the last part, in the constraints, shape (n, columns); None:
             they are one.
     """
@@ -77,4 +79,5 @@ class ElementBlocks(NamedTuple):
     columns: tuple[IntArray, ...]
     numbers: tuple[IntArray, ...]
     pattern: npt.NDArray[np.bool_]
+    entries: npt.NDArray[np.bool_]
     weights: npt.NDArray[np.float64] | None = None

@@ -321,9 +321,10 @@ class StepProblem:
 
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
-        motion, moved = self.lengths.farthest, float(self.lengths.moved.max())
+        motion = float(self.lengths.motion.max())
         gap = np.array([0.0, 1.0, 0.0, 0.0])
-        limits = batch.ratios(None, gap, motion, motion + moved, self.rtol)
+        rounded = motion + self.lengths.rounded
+        limits = batch.ratios(None, gap, motion, rounded, self.rtol)
         return 1.0 / limits[f"{batch.name} constraints"]
 
     def residual(self, e: Evaluation) -> FloatArray:

@@ -86,9 +86,12 @@ class Lengths:
         return longest[self._group]
 
     @property
-    def farthest(self) -> float:
-        """Motion of a body in the step, as predicted, or as it would be without what holds it."""
-        return max(float(self.motion.max()), self.fall)
+    def rounded(self) -> float:
+        """Length beside the motion of the step whose rounding is in all positions.
+
+        A body at rest may have no extent, but the forces on it are rounded as its fall would be.
+        """
+        return float(self.moved.max()) + self.fall
 
     @property
     def span(self) -> float:

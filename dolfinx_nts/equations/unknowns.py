@@ -105,7 +105,8 @@ class Unknowns:
         offset = {name: self.layout.start(f) for name, f in self.own.items()}
         for c, of in zip(elements, bodies, strict=True):
             if not all(self._batches.batch_of(b) in self._field for b in of):
-                blocks.append(ElementBlocks((), (), (), np.empty((0, 0), dtype=bool)))
+                none = np.empty((0, 0), dtype=bool)
+                blocks.append(ElementBlocks((), (), (), none, none))
                 continue
             of_bodies = [self._in_field(b, dofs) for b, dofs in zip(of, c.dofs(), strict=True)]
             numbers = [number for _, number in of_bodies]
@@ -113,10 +114,11 @@ class Unknowns:
                 shape = c.num_elements, c.widths[name]
                 numbers.append(offset[name] + np.arange(shape[0] * shape[1]).reshape(shape))
             stops = np.cumsum([0, *(n.shape[1] for n in numbers)])
-            pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
+            pattern, entries = np.ones((2, stops[-1], stops[-1]), dtype=bool)
             columns, weights = [np.arange(a, b) for a, b in pairwise(stops)], None
             both = np.arange(stops[len(of_bodies)])
             if "constraints" in self.own:
+                pattern[stops[-2] :, stops[-2] :] = c.pattern
                 both = np.concatenate([both, columns[-1]])
                 if c.combination is not None:
                     number, weight, _ = c.combination
@@ -124,11 +126,13 @@ class Unknowns:
                     weights = weight.reshape(len(weight), len(columns[-1]))
                     new = offset["constraints"] + number.reshape(weights.shape)
                     numbers[-1] = np.where(weights == 0.0, -1, new)
-            pattern[np.ix_(both, both)] = c.entries[: len(both), : len(both)]
+            entries[np.ix_(both, both)] = c.entries[: len(both), : len(both)]
             for name in self.own:
                 offset[name] += _size(c, name)
             fields = (*(field for field, _ in of_bodies), *self.own.values())
-            block = ElementBlocks(fields, tuple(columns), tuple(numbers), pattern, weights)
+            block = ElementBlocks(
+                fields, tuple(columns), tuple(numbers), pattern, entries, weights
+            )
             blocks.append(block)
         return blocks
 

@@ -125,8 +125,8 @@ def _of_elements(problem: StepProblem, e: Evaluation) -> list[dict[str, float]]:
         if of is not None:
             np.maximum.at(extents, of, c.extents if np.ndim(of) else c.extent)
     top = global_max(comm, np.array([*local, *extents]))
-    motion = max(top[0], problem.lengths.farthest)
-    rounded = motion + float(problem.lengths.moved.max())
+    motion = max(top[0], float(problem.lengths.motion.max()))
+    rounded = motion + problem.lengths.rounded
     extents = top[len(local) :]
     sizes, found = top[2 : len(local)].reshape(-1, 4), []
     for c, part, largest, of in zip(elements, e.parts, sizes, linked, strict=True):

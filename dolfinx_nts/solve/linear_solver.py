@@ -234,6 +234,15 @@ class SolverOptions:
         return int(self._all["ksp_max_it"])
 
     @property
+    def pivots(self) -> bool:
+        """Whether factors take any entry of a column for its pivot, as KLU's do.
+
+        They need no room beside the entries that can be non-zero, which MUMPS does: without it
+        redundant contacts of rigid bodies leave it no pivot.
+        """
+        return bool(self._all.get("pc_factor_mat_solver_type") == "klu")
+
+    @property
     def split(self) -> bool:
         """Whether the preconditioner is a field split, which takes the blocks of a nest."""
         return bool(self._all["pc_type"] == "fieldsplit")
@@ -296,11 +305,10 @@ class SolverOptions:
         for name, source in options.items():
             database[prefix + name] = self._all[source]
             self._entered[prefix + name] = source
-        klu = self._all.get("pc_factor_mat_solver_type") == "klu"
         try:
-            with petsc_compat.klu_ordering() if klu else nullcontext():
+            with petsc_compat.klu_ordering() if self.pivots else nullcontext():
                 snes.setFromOptions()
-                if klu:
+                if self.pivots:
                     ksp, (matrix, source, _) = snes.getKSP(), snes.getJacobian()
                     ksp.setOperators(matrix, source)
                     ksp.getPC().setFactorSetUpSolverType()

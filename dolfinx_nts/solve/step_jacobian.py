@@ -40,8 +40,11 @@ class StepJacobian:
         bodies, fresh = self.tangents.at(e)
         new, options, laid = self.matrix is None, self._presets.options, self._problem.laid
         if self.matrix is None:
+            blocks = laid.blocks
+            if options.pivots:
+                blocks = [b._replace(pattern=b.pattern & b.entries) for b in blocks]
             self.matrix = StepMatrix(
-                laid.layout, bodies, laid.blocks, split=options.split, blocked=options.blocked
+                laid.layout, bodies, blocks, split=options.split, blocked=options.blocked
             )
             if options.augmented:
                 self._augmented = AugmentedMatrix(self._problem, bodies)

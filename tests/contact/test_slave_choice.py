@@ -1,5 +1,7 @@
 """`ContactPair.between`: which surface it makes the slave, and what that saves."""
 
+from functools import partial
+
 from mpi4py import MPI
 
 import numpy as np
@@ -131,9 +133,12 @@ def impact(make):
 
 @pytest.mark.slow
 def test_master_nodes_enter_less_with_the_chosen_slave():
-    coarse, fine = impact(nts.ContactPair), impact(nts.ContactPair.between)
-    assert abs(coarse - 0.03) < 0.002
-    assert fine < 0.6 * coarse
+    """Of nodes alone 3 % of the edge for 1.6 %; corners of the master take that to a third."""
+    makers = nts.ContactPair, nts.ContactPair.between
+    coarse, fine = (impact(partial(make, edges=False)) for make in makers)
+    assert abs(coarse - 0.03) < 0.002 and fine < 0.6 * coarse
+    for make, of_nodes in zip(makers, (coarse, fine), strict=True):
+        assert impact(make) < 0.4 * of_nodes
 
 
 @pytest.mark.slow

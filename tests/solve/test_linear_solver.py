@@ -279,7 +279,7 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
     ("cells", "masters"),
     [(1, ()), (4, ()), (4, ("mesh",)), (4, ("sphere",)), (4, ("mesh", "sphere"))],
 )
-@pytest.mark.fast("1-masters0", "4-masters2")
+@pytest.mark.fast("1-masters0", "4-masters4")
 def test_matrix_in_blocks_of_nodes(cells, masters):
     """Against AIJ made by way of a nest, with nodes that are held along some axes.
 
