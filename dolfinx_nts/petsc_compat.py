@@ -240,19 +240,24 @@ def option_used(name: str) -> bool:
     return bool(used.value)
 
 
+#: KLU's ordering, for any pivots, and how large a pivot is beside its column.
+_KLU = {"mat_klu_ordering": "COLAMD", "mat_klu_pivot_tol": 0.1}
+
+
 @contextmanager
-def klu_ordering() -> Iterator[None]:
-    """Let factors of KLU that are made within have an ordering for any pivots.
+def klu_options() -> Iterator[None]:
+    """Let factors of KLU that are made within take any entry of a column for its pivot.
 
     Rows of joints have no diagonal to pivot on: an ordering for pivots on the diagonal fills in a
-    hundred times as much. PETSc asks for it when it makes the factors alone, and without a prefix.
+    hundred times as much, and small pivots cost digits of the momenta. PETSc asks for these options
+    when it makes the factors alone, and without a prefix.
     """
-    options, name = PETSc.Options(), "mat_klu_ordering"
-    if options.hasName(name):
-        yield
-        return
-    options[name] = "COLAMD"
+    options = PETSc.Options()
+    ours = {name: value for name, value in _KLU.items() if not options.hasName(name)}
+    for name, value in ours.items():
+        options[name] = value
     try:
         yield
     finally:
-        options.delValue(name)
+        for name in ours:
+            options.delValue(name)

@@ -306,7 +306,7 @@ class SolverOptions:
             database[prefix + name] = self._all[source]
             self._entered[prefix + name] = source
         try:
-            with petsc_compat.klu_ordering() if self.pivots else nullcontext():
+            with petsc_compat.klu_options() if self.pivots else nullcontext():
                 snes.setFromOptions()
                 if self.pivots:
                     ksp, (matrix, source, _) = snes.getKSP(), snes.getJacobian()
