@@ -67,7 +67,8 @@ def assert_closed(run, tolerance=1e-12):
     assert run.status == "completed"
     assert np.abs(table["ledger_residual"]).max() < tolerance * top
     for name in ("friction_dissipation", "contact_defect"):
-        assert (np.diff(table[name]) >= -1e-13 * top).all()
+        # The force times the rounding of the cable's length.
+        assert (np.diff(table[name]) >= -0.1 * tolerance * top).all()
 
 
 @rules
