@@ -18,7 +18,7 @@ _CANCELLED = 32 * float(np.finfo(float).eps)
 
 def worst(problem: StepProblem, e: Evaluation) -> float:
     """The largest of `ratios`. Collective."""
-    of_bodies, of_elements = _over_limits(problem, e), _of_elements(problem, e)
+    of_bodies, of_elements = _of_bodies(problem, e), _of_elements(problem, e)
     found = np.array([of_bodies.max(), *(max(one.values()) for one in of_elements if one)])
     if of_elements:
         found = global_max(problem.system.comm, found.max(keepdims=True))
@@ -31,7 +31,7 @@ def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     Collective.
     """
     names = [body.name for body in problem.system.bodies]
-    ratio = dict(zip(names, _over_limits(problem, e).tolist(), strict=True))
+    ratio = dict(zip(names, _of_bodies(problem, e).tolist(), strict=True))
     for found in _of_elements(problem, e):
         # Several contacts of two bodies have one name.
         for name, value in found.items():
@@ -71,20 +71,21 @@ def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
     return abs(work[:, 0].sum()) > share * np.abs(work[:, 1:5]).max() + rounding
 
 
-def _over_limits(
-    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray] | None = None,
-    rounding: FloatArray | None = None,
-) -> FloatArray:  # fmt: skip
-    """A force on each batch over that which counts as zero, by body; asleep 0. Collective.
+def _of_bodies(problem: StepProblem, e: Evaluation) -> FloatArray:
+    """`ratios` of the bodies, shape (bodies,). Collective."""
+    residuals = [terms.residual for terms in e.terms]
+    return _over_limits(problem, e, residuals, problem.rounding.forces)
 
-    The force is the residual unless another is given, with its rounding.
+
+def _over_limits(
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
+) -> FloatArray:
+    """A force on each batch over that which counts as zero, by body; asleep 0. Collective.
 
     It is measured by the largest of its inertial, internal, external and coupling forces. Of
     elements' forces that cancel each other, as on a body without mass of note between two springs,
     only the rounding counts, so that strong joints loosen no tolerance.
     """
-    if forces is None or rounding is None:
-        forces, rounding = [terms.residual for terms in e.terms], problem.rounding.forces
     batches, parts = problem.batches, _forces_on(problem, e, forces)
     squares = np.empty((6, batches.count))
     squares[:5] = batches.sums([np.square(own) for own in parts])
