@@ -48,23 +48,38 @@ GAP = 0.05e-3
 CLIMB = GAP + UNDERCUT / np.tan(LEAD)
 
 
-def theory():
-    """Insertion force at the end of the lead-in face, on the flat one, and the textbook's [N]."""
-    stiffness = YOUNG * WIDTH * HEIGHT**3 / 12
-    phi, found = np.arctan(FRICTION), []
-    for face in (LEAD, 0.0):
+def insertion(stiffness, length, top, undercut, lead, friction):
+    """Insertion force of a beam with a nose at the end of the lead-in face and on the flat one [N].
+
+    Args:
+        stiffness: EI [N m^2].
+        length: Of the beam [m].
+        top: Of the nose over the beam's axis [m].
+        undercut: By which the nose must give way [m].
+        lead: Angle of the lead-in face [rad].
+        friction: Its coefficient.
+    """
+    phi, found = np.arctan(friction), []
+    for face in (lead, 0.0):
         theta, push = 0.0, 0.1
         for _ in range(100):
             # The nose turns with the end, and so does the arm of both forces about it.
-            k, arm = (push / stiffness) ** 0.5, TOP * (1.0 - theta / np.tan(face + theta + phi))
-            way = UNDERCUT - TOP * (1.0 - np.cos(theta)) - arm
-            press = push * (way + arm / np.cos(k * LENGTH)) / (np.tan(k * LENGTH) / k - LENGTH)
-            bent = (press * LENGTH / push + way) * k * np.sin(k * LENGTH)
-            theta = bent - press / push * (1.0 - np.cos(k * LENGTH))
+            k, arm = (push / stiffness) ** 0.5, top * (1.0 - theta / np.tan(face + theta + phi))
+            way = undercut - top * (1.0 - np.cos(theta)) - arm
+            press = push * (way + arm / np.cos(k * length)) / (np.tan(k * length) / k - length)
+            bent = (press * length / push + way) * k * np.sin(k * length)
+            theta = bent - press / push * (1.0 - np.cos(k * length))
             push = press * np.tan(face + theta + phi)
         found.append(float(push))
-    textbook = 3 * stiffness * UNDERCUT / LENGTH**3 * np.tan(LEAD + phi)
-    return found[0], found[1], float(textbook)
+    return found
+
+
+def theory():
+    """Insertion force at the end of the lead-in face, on the flat one, and the textbook's [N]."""
+    stiffness = YOUNG * WIDTH * HEIGHT**3 / 12
+    found = insertion(stiffness, LENGTH, TOP, UNDERCUT, LEAD, FRICTION)
+    textbook = 3 * stiffness * UNDERCUT / LENGTH**3 * np.tan(LEAD + np.arctan(FRICTION))
+    return *found, float(textbook)
 
 
 def prism(comm, profile, cells, width):

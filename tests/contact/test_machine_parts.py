@@ -4,6 +4,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import snap_fit
 from gmsh_parts import of_gmsh
 from measures import kinds
 from scenes import everywhere
@@ -240,21 +241,10 @@ def hook(cells):
 
 
 def insertion():
-    """Force at the end of the lead-in face and on the flat one [N]; see `demos/snap_fit.py`."""
-    stiffness, length, top = YOUNG * BREADTH * THICK**3 / 12, SPRING + FLAT, 0.5 * THICK + NOSE
+    """Force at the end of the lead-in face and on the flat one [N]."""
     lead = np.arctan((NOSE - BLUNT) / NOSE * np.tan(LEAD))
-    phi, found = np.arctan(RUBS), []
-    for face in (lead, 0.0):
-        theta, push = 0.0, 1.0
-        for _ in range(100):
-            k, arm = (push / stiffness) ** 0.5, top * (1.0 - theta / np.tan(face + theta + phi))
-            way = UNDERCUT - top * (1.0 - np.cos(theta)) - arm
-            down = push * (way + arm / np.cos(k * length)) / (np.tan(k * length) / k - length)
-            bent = (down * length / push + way) * k * np.sin(k * length)
-            theta = bent - down / push * (1.0 - np.cos(k * length))
-            push = down * np.tan(face + theta + phi)
-        found.append(float(push))
-    return found
+    stiffness, length = YOUNG * BREADTH * THICK**3 / 12, SPRING + FLAT
+    return snap_fit.insertion(stiffness, length, 0.5 * THICK + NOSE, UNDERCUT, lead, RUBS)
 
 
 @pytest.mark.slow
