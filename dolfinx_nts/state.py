@@ -74,6 +74,8 @@ class State:
         contacts: What each contact remembers of its slave nodes.
         joints: What each of `System.joints` remembers.
         edges: What the edges of each contact remember; empty without contacts.
+        inner: What forces of each body depend on beside u, see `Body.inner`; empty where no body
+            has any.
     """
 
     time: float
@@ -83,6 +85,11 @@ class State:
     contacts: tuple[ContactHistory, ...]
     joints: tuple[Any, ...]
     edges: tuple[EdgeHistory, ...] = ()
+    inner: tuple[FloatArray, ...] = ()
+
+    def inner_of(self, k: int) -> FloatArray | None:
+        """Of a body, where it has any."""
+        return self.inner[k] if self.inner else None
 
     def acceleration(self, k: int) -> FloatArray | None:
         """Of a body [m/s^2], where the integrator carries any."""

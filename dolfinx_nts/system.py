@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -208,7 +208,25 @@ class System:
             contacts=tuple(c.history_at_start() for c in self.pairs),
             joints=tuple(joint.start() for joint in self.joints),
             edges=tuple(EdgeHistory.of_start() for _ in self.contacts),
+            inner=self.inner_of(lambda k: self.bodies[k].inner_at_start),
         )
+
+    def inner_of(self, each: Callable[[int], FloatArray]) -> tuple[FloatArray, ...]:
+        """`State.inner`, of what a function gives for each body that has any."""
+        if not self.has_inner:
+            return ()
+        none = np.empty(0)
+        return tuple(each(k) if b.has_inner else none for k, b in enumerate(self.bodies))
+
+    def take_inner(self, state: State) -> None:
+        """Give its bodies what `State.inner` has of them."""
+        for body, inner in zip(self.bodies, state.inner, strict=False):
+            body.take_inner(inner)
+
+    @cached_property
+    def has_inner(self) -> bool:
+        """Whether any body has, see `Body`."""
+        return any(body.has_inner for body in self.bodies)
 
     @staticmethod
     def _at_start(body: Body) -> FloatArray:

@@ -48,6 +48,7 @@ class Body:
         rigid: Whether no motion changes distances in it, so that `directions` turn with it.
         oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
         bound: Whether its own constraints are half as many as its coordinates, or about that.
+        has_inner: Whether forces depend on more than its coordinates, see `inner`.
         length: What its directors are multiples of [m].
         rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
             all ranks; None: the size of the positions.
@@ -78,6 +79,7 @@ class Body:
     rigid: bool = False
     oriented: bool = False
     bound: bool = False
+    has_inner: bool = False
     length: float
     rounded: float | None = None
     allow_inversion: bool = False
@@ -136,6 +138,40 @@ class Body:
         raise self._missing("potential")
 
     # ---- what may be left as it is
+    @property
+    def inner_at_start(self) -> FloatArray:
+        """`inner` of its displacement at the start. Collective."""
+        return np.empty(0)
+
+    def inner(self, u1: FloatArray) -> FloatArray:
+        """What forces of the next step depend on beside u, at the end of the step that has begun.
+
+        Of a body with `has_inner`: as many numbers of this rank at each time, the same number for
+        each of `inner_numbers`. `begin_step` takes those of t_n. Collective.
+
+        Args:
+            u1: Displacement at t_{n+1} [m].
+        """
+        return np.empty(0)
+
+    @property
+    def inner_numbers(self) -> IntArray:
+        """Numbers in files of the parts of `inner`, which do not depend on the ranks."""
+        return np.empty(0, dtype=np.int64)
+
+    def doubts(self, u: FloatArray) -> list[Any]:
+        """What may be wrong with an accepted state, as `StepWarning`, of a body with `has_inner`.
+
+        Collective.
+
+        Args:
+            u: Owned displacements [m].
+        """
+        return []
+
+    def take_inner(self, inner: FloatArray) -> None:
+        """Take `inner` of the state that `potential` and `accept` are asked of next."""
+
     @cached_property
     def initial_displacement(self) -> FloatArray:
         """Displacement u at the start [m], shape (num_owned,)."""

@@ -60,8 +60,11 @@ class Loads:
             drifts = batches.split(found)
         # Load steps of equilibrium end with some of no length.
         rate, ramp = rule.theta * rule.rate(dt) if rule.inertia else 0.0, rule.ramp(when)
-        both = zip(state.u, drifts, strict=True)
-        return [EvaluationPoint(u, when, ramp, rate, drift) for u, drift in both]
+        both = enumerate(zip(state.u, drifts, strict=True))
+        return [
+            EvaluationPoint(u, when, ramp, rate, drift, state.inner_of(k))
+            for k, (u, drift) in both
+        ]
 
     def work_at_ends(self, e: Evaluation) -> float:
         """What work of loads at both ends adds on this rank, times `factor`. Collective.

@@ -21,6 +21,7 @@ class EvaluationPoint(NamedTuple):
         ramp: Part of constant loads that acts.
         rate: Change of the velocity there with u_1 [1/s]; 0 in statics.
         drift: Velocity there for u_1 = u_0 [m/s]; None: zero.
+        inner: What else forces depend on at t_n, see `Body.inner`.
     """
 
     u0: FloatArray
@@ -28,6 +29,7 @@ class EvaluationPoint(NamedTuple):
     ramp: float = 1.0
     rate: float = 0.0
     drift: FloatArray | None = None
+    inner: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

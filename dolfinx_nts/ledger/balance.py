@@ -137,6 +137,7 @@ def measure(
         kinetic, potential, linear_momentum (3,), angular_momentum (3,).
     """
     local, known = np.zeros(8), {} if known is None else known
+    system.take_inner(state)
     for body, u, v in _ends(system, state):
         last = known.get(body.name)
         if last is None or last[0] is not u or last[1] is not v:

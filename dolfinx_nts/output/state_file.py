@@ -9,6 +9,7 @@ Version 9, with h5py's names of types:
 - `bodies/K/NAME`, of body K of the system, shape (nodes, 3), in the order of `Body.file_order`:
   `reference` X [m], `u` [m], `v` [m/s]; `a` [m/s^2], where the integrator carries any; further
   fields of the run, of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`;
+- `inner/K/number` and `inner/K/value`, of body K that has `Body.inner`, one row a cell;
 - `contacts/K/NAME`, of contact K, shape (slave nodes, ...): `number`, the input number of the node,
   ascending, and the fields of `ContactHistory`; further ones of the run;
 - `edges/K/NAME`, of the edges of contact K that press on each other: the fields of `EdgeHistory`;
@@ -41,11 +42,11 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.ledger import balance, resultants
+from dolfinx_nts.output.scene_record import ROUNDED
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
 from dolfinx_nts.state import ContactHistory, EdgeHistory, State
 from dolfinx_nts.system import System
-from dolfinx_nts.types import Array, FloatArray, IntArray, Rows
+from dolfinx_nts.types import Array, FloatArray, IntArray
 
 #: Arrays of a file by their place in it, on rank 0; empty elsewhere.
 Tables = dict[str, Array]
@@ -59,111 +60,8 @@ _OTHER = {
 _VERSION = 9
 #: What stands between the HDF5 part and its checksum.
 _MARK = b"crc32"
-#: Options of bodies that are loads and supports.
-_LOADS = ("body_force", "traction", "bcs", "forces", "force", "torque")
-#: Differences that a refusal names.
-_NAMED = 5
-#: Part of masses and of a body's size by which the same scene may differ on other ranks.
-_ROUNDED = 1e-9
 
 
-# ---- what is in the scene
-def describe(system: System) -> dict[str, Any]:
-    """Return what a system must share with the one of a checkpoint, for JSON. Collective."""
-    comm, bodies = system.comm, system.bodies
-    sizes = [[b.num_owned // 3, float(b.nodal_mass[::3].sum())] for b in bodies]
-    total = comm.allreduce(np.array(sizes))
-    empty = dict.fromkeys(balance.columns(system), 0.0) | resultants.at_start(system)
-    empty |= dict.fromkeys(("linear_momentum", "angular_momentum"), np.zeros(3))
-    return {
-        "bodies": [
-            {
-                "name": b.name,
-                "kind": type(b).__name__,
-                "degree": b.degree,
-                "nodes": int(nodes),
-                "mass": float(mass),
-            }
-            for b, (nodes, mass) in zip(bodies, total, strict=True)
-        ],
-        "contacts": [_describe_contact(pair) for pair in system.contacts],
-        "joints": [
-            _settings(j) | {"name": j.name, "kind": type(j).__name__} for j in system.joints
-        ],
-        "gravity": system.gravity.tolist(),
-        "columns": {name: list(np.shape(value)) for name, value in empty.items()},
-    }
-
-
-def loads(system: System) -> Rows:
-    """Constant loads and supports of the bodies by their options, for JSON; functions are None."""
-    settings = [_settings(body) for body in system.bodies]
-    return [
-        {"name": body.name} | {name: of[name] for name in _LOADS if name in of}
-        for body, of in zip(system.bodies, settings, strict=True)
-    ]
-
-
-def _settings(item: Any) -> dict[str, Any]:
-    """`settings` of a body, joint or obstacle, as they come back from JSON; functions are None."""
-    text = json.dumps(item.settings, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
-    return json.loads(text)
-
-
-def _describe_contact(pair: Any) -> dict[str, Any]:
-    found = {
-        "name": pair.name, "friction": float(pair.friction), "adjust": pair.adjust,
-        "integration": pair.integration,
-    }  # fmt: skip
-    for role in ("slave", "master"):
-        surface = getattr(pair, role)
-        facets = getattr(surface, "facets", None)
-        if facets is None:
-            found[role] = _settings(surface) | {"kind": type(surface).__name__}
-        else:
-            numbers = np.ascontiguousarray(surface.original[facets], dtype=np.int64)
-            found[role] = {
-                "nodes": len(surface.original),
-                "facets": len(facets),
-                "which facets": zlib.crc32(numbers.tobytes()),
-            }
-    return found
-
-
-def differences(there: Any, here: Any, where: str = "") -> list[str]:
-    """Sentences on what differs between two descriptions.
-
-    Args:
-        there: Of the file.
-        here: Of the system.
-        where: Place in both.
-    """
-    if isinstance(there, dict) and isinstance(here, dict):
-        named = "name" in there and there["name"] == here.get("name")
-        name = f" of {there['name']!r}" if named else ""
-        pairs = [(f"{where}.{k}" if where else k, there.get(k), here.get(k))
-                 for k in dict.fromkeys((*there, *here))]  # fmt: skip
-        return [text + name for pair in pairs for text in differences(*pair[1:], pair[0])]
-    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
-        pairs = [(f"{where}[{k}]", a, b) for k, (a, b) in enumerate(zip(there, here, strict=True))]
-        return [text for pair in pairs for text in differences(*pair[1:], pair[0])]
-    if isinstance(there, float) and isinstance(here, float):
-        # Equal infinities have no difference.
-        same = there == here or abs(there - here) <= _ROUNDED * max(abs(there), abs(here))
-    else:
-        same = there == here
-    if isinstance(there, list) and isinstance(here, list):
-        there, here = ([item.get("name", item) if isinstance(item, dict) else item
-                        for item in items] for items in (there, here))  # fmt: skip
-    return [] if same else [f"{where} is {there!r} there and {here!r} here"]
-
-
-def listed(sentences: list[str]) -> str:
-    """The first of some differences."""
-    return "; ".join(sentences[:_NAMED]) + ("; ..." if len(sentences) > _NAMED else "")
-
-
-# ---- a state in the numberings of the file
 class Numbering:
     """Between the arrays of the ranks and those of the file. Collective."""
 
@@ -227,6 +125,10 @@ class Numbering:
             found = {name: gather_on_root(self.comm, v) for name, v in edges._asdict().items()}
             order = np.lexsort(found["pair"].T[::-1]) if self.comm.rank == 0 else []
             tables |= {f"edges/{k}/{name}": rows[order] for name, rows in found.items()}
+        for k, values in self._with_inner(state.inner):
+            numbers = self.system.bodies[k].inner_numbers
+            cells = {"number": numbers, "value": values.reshape(len(numbers), -1)}
+            tables |= self._rows(f"inner/{k}", cells)
         for k, joint in enumerate(self.system.joints):
             value = state.joints[k]
             raise_together(self.comm, _misfit(joint, value), TypeError)
@@ -240,6 +142,21 @@ class Numbering:
         found = {name: gather_on_root(self.comm, values) for name, values in rows.items()}
         order = np.argsort(found["number"])
         return {f"{place}/{name}": values[order] for name, values in found.items()}
+
+    def _with_inner(self, values: Sequence[Any]) -> list[tuple[int, Any]]:
+        """Numbers of bodies that have `Body.inner`, with values of all bodies, if there are any."""
+        bodies = self.system.bodies
+        return [(k, v) for k, v in enumerate(values) if bodies[k].has_inner]
+
+    def _inner(self, tables: Tables) -> tuple[FloatArray, ...]:
+        """`State.inner` of a file. Collective."""
+
+        def of_body(k: int) -> FloatArray:
+            body, names = self.system.bodies[k], ("number", "value")
+            rows = self._share(tables, f"inner/{k}", names)
+            return self._at(rows, "value", body.inner_numbers, body.name).ravel()
+
+        return self.system.inner_of(of_body)
 
     def unpack(self, tables: Tables, time: float) -> State:
         """The state of a file. Collective."""
@@ -258,6 +175,7 @@ class Numbering:
             contacts=tuple(itertools.starmap(ContactHistory, zip(*parts, strict=True))),
             joints=tuple(joints),
             edges=tuple(self._edges(tables, k) for k in range(len(self.system.contacts))),
+            inner=self._inner(tables),
         )
 
     def _edges(self, tables: Tables, k: int) -> EdgeHistory:
@@ -312,7 +230,7 @@ class Numbering:
         problem = None
         for k, here in enumerate(self.reference if self.comm.rank == 0 else []):
             off = np.abs(here - tables[f"bodies/{k}/reference"]).max(initial=0.0)
-            if not off <= _ROUNDED * np.ptp(here, axis=0).max(initial=0.0):
+            if not off <= ROUNDED * np.ptp(here, axis=0).max(initial=0.0):
                 problem = problem or (
                     f"body {self.system.bodies[k].name!r}: its mesh has other nodes, up to "
                     f"{off:.3g} away, or the same in another order"

@@ -105,11 +105,12 @@ class Saver:
         self._what = f"checkpoint: path={str(self._path)!r}"
         comm = stepper.system.comm
         # A run without checkpoints loads no writers.
+        from dolfinx_nts.output import scene_record as scenes
         from dolfinx_nts.output import state_file as files
 
         write_on_root(comm, self._what, lambda: files.prepare(self._path))
         self._numbering = files.Numbering(stepper.system)
-        self._scene, self._loads = files.describe(stepper.system), files.loads(stepper.system)
+        self._scene, self._loads = scenes.describe(stepper.system), scenes.loads(stepper.system)
         self._numbering.pack(stepper.state, {}, {})
 
     def step(self) -> None:
@@ -191,6 +192,7 @@ def restart(path: StrPath, system: System) -> Restart:
         ValueError: The file is none, or the system has other bodies, meshes, masses, contacts or
             joints.
     """
+    from dolfinx_nts.output import scene_record as scenes
     from dolfinx_nts.output import state_file as files
 
     place = as_path("path", path)
@@ -200,10 +202,10 @@ def restart(path: StrPath, system: System) -> Restart:
     comm = system.comm
     tables, notes = on_root(comm, lambda: _read(place)) or ({}, {})
     notes = comm.bcast(notes)
-    found = files.differences(notes["scene"], files.describe(system))
+    found = scenes.differences(notes["scene"], scenes.describe(system))
     if found:
         raise ValueError(
-            f"path={str(path)!r}: was written by another system: {files.listed(found)}; make the "
+            f"path={str(path)!r}: was written by another system: {scenes.listed(found)}; make the "
             "system as it was, or start from the Solution of another run"
         )
     numbering = files.Numbering(system)
@@ -224,9 +226,9 @@ def restart(path: StrPath, system: System) -> Restart:
         nodal_memory={"unknowns": numbering.nodal(tables, "unknowns")} | before,
         pace=pace,
     )
-    changed = files.differences(notes["loads"], files.loads(system))
+    changed = scenes.differences(notes["loads"], scenes.loads(system))
     if changed:
-        text = f"the restart was given other loads or supports: {files.listed(changed)}"
+        text = f"the restart was given other loads or supports: {scenes.listed(changed)}"
         made.warn("loads changed", notes["time"], len(changed), text)
     return made
 

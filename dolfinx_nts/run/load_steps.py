@@ -169,6 +169,7 @@ class LoadStepper(Stepper):
         self._accept(state)
         step_warnings.tell_inversion(self.solution, self.problem, step, state)
         step_warnings.tell_couplings(self.solution, self.problem, step, state)
+        step_warnings.tell_doubts(self.solution, state)
         self._solved = step
         self._locking.look()
         self.look()

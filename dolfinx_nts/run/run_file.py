@@ -84,13 +84,14 @@ def save(
     path: Path,
 ) -> None:
     """Write a run, and further fields of its bodies; see `Solution.save`. Collective."""
+    from dolfinx_nts.output import scene_record as scenes
     from dolfinx_nts.output import state_file as files
     from dolfinx_nts.output.whole_files import replace_file
 
     tables = files.Numbering(system).pack(state, fields, {})
     of_record, notes = record.packed()
     tables |= of_record
-    notes |= {"scene": files.describe(system), "time": state.time, "versions": versions()}
+    notes |= {"scene": scenes.describe(system), "time": state.time, "versions": versions()}
     write_on_root(
         system.comm, f"path={str(path)!r}",
         lambda: replace_file(path, files.image(files.SOLUTION, tables, notes)),

@@ -160,6 +160,7 @@ def of_file(start: Any, system: System) -> Any:
     """
     if not isinstance(start, Saved):
         return start
+    from dolfinx_nts.output import scene_record as scenes
     from dolfinx_nts.output import state_file as files
 
     if "load_steps" not in start.settings:
@@ -167,10 +168,10 @@ def of_file(start: Any, system: System) -> Any:
             "start: the file holds a run in time, whose steps need more than it has; let that run "
             "write a Checkpoint, and pass restart(path, system)"
         )
-    found = files.differences(start.scene, files.describe(system))
+    found = scenes.differences(start.scene, scenes.describe(system))
     if found:
         raise ValueError(
-            f"start: the file is of another system: {files.listed(found)}; make the system as it "
+            f"start: the file is of another system: {scenes.listed(found)}; make the system as it "
             "was, or start from the result itself"
         )
     numbering, tables = files.Numbering(system), start.tables()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dolfinx_nts.bodies.batch import BodyBatch
@@ -11,6 +13,7 @@ from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import FAR_TURN
 from dolfinx_nts.parallel import anywhere, global_max
@@ -88,6 +91,14 @@ def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state:
     _tell_turns(solution, problem, state)
     tell_inversion(solution, problem, step, state)
     tell_couplings(solution, problem, step, state)
+    tell_doubts(solution, state)
+
+
+def tell_doubts(solution: Solution, state: State) -> None:
+    """Warn of what bodies themselves doubt in an accepted state. Collective."""
+    for k, body in enumerate(solution.system.bodies):
+        if body.has_inner:
+            _tell(solution, state, body.doubts(state.u[k]))
 
 
 def tell_overlap(solution: Solution, watch: OverlapWatch, state: State, *, last: bool) -> None:
@@ -129,10 +140,14 @@ def tell_couplings(
 ) -> None:
     """Warn of what contacts and joints tell. Collective; arguments as of `tell_step`."""
     for coupling, parts in problem.couplings.each(step):
-        for found in coupling.warnings(parts):
-            solution.warn(
-                found.kind, state.time, found.size, found.text, about=found.about, grave=found.grave
-            )
+        _tell(solution, state, coupling.warnings(parts))
+
+
+def _tell(solution: Solution, state: State, warnings: Sequence[StepWarning]) -> None:
+    for found in warnings:
+        solution.warn(
+            found.kind, state.time, found.size, found.text, about=found.about, grave=found.grave
+        )
 
 
 def tell_stressed(solution: Solution, time: float) -> None:

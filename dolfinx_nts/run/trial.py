@@ -81,12 +81,17 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
     places = [terms.u1.copy() for terms in step.terms]
     speeds = [v1 for v1, _ in ends]
     moved, sped = _moves(problem, places, speeds)
+    moved[[body.has_inner for body in problem.system.bodies]] = 1.0
     u = _renewed(old.u, batches.split(places), moved)
     v, a = _renewed(old.v, batches.split(speeds), sped), old.a
     if a:
         found = batches.split([a1 for _, a1 in ends if a1 is not None])
         a = _renewed(a, found, problem.is_awake)
-    return State(time, u, v, a, *problem.couplings.history(step))
+    system, awake = problem.system, problem.is_awake
+    inner = system.inner_of(
+        lambda k: system.bodies[k].inner(u[k]) if awake[k] else old.inner[k]
+    )
+    return State(time, u, v, a, *problem.couplings.history(step), inner=inner)
 
 
 def _renewed(

@@ -110,8 +110,10 @@ def accelerating_forces(
     """
     still = tuple(np.zeros_like(v) for v in state.v)
     ramp = problem.integrator.ramp(state.time)
-    both = zip(state.u, state.v, strict=True)
-    moments = [EvaluationPoint(u, state.time, ramp, 0.0, v) for u, v in both]
+    both = enumerate(zip(state.u, state.v, strict=True))
+    moments = [
+        EvaluationPoint(u, state.time, ramp, 0.0, v, state.inner_of(k)) for k, (u, v) in both
+    ]
     problem.begin(replace(state, a=still), dt, moments=moments)
     problem.guess(flight=False, forces=True, carried=True)
     contact = [terms.coupling / problem.factor for terms in problem.evaluate(problem.x).bodies]

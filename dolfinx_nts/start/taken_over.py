@@ -73,6 +73,10 @@ def state_from(
     start = replace(
         found, time=time, u=u, contacts=tuple(contacts), joints=tuple(joints), edges=tuple(edges)
     )
+    if state.inner:
+        start = replace(
+            start, inner=system.inner_of(lambda k: state.inner[index[system.bodies[k].name]])
+        )
     if moving:
         v = tuple(state.v[index[b.name]].copy() for b in system.bodies)
         a = tuple(state.a[index[b.name]].copy() for b in system.bodies) if state.a else ()

@@ -29,15 +29,8 @@ from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
-from dolfinx_nts.output.state_file import (
-    CHECKPOINT,
-    Numbering,
-    describe,
-    differences,
-    previous,
-    read,
-    write,
-)
+from dolfinx_nts.output.scene_record import describe, differences
+from dolfinx_nts.output.state_file import CHECKPOINT, Numbering, previous, read, write
 
 COMM = MPI.COMM_WORLD
 DT, STEPS, EVERY = 2e-3, 14, 9

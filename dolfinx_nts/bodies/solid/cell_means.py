@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import ufl
@@ -163,68 +163,125 @@ class CellMeans:
         return dict(zip(forms, compile_forms(list(forms.values())), strict=True))
 
 
+class NodesOfCells:
+    """What each of this rank's cells adds to the coordinates of its nodes.
+
+    Args:
+        space: Function space of the displacements.
+
+    Attributes:
+        space: Of displacements in each cell apart: a linear form with a test function in it is
+            summed over no cells.
+        entries: Of such a form, shape (cells, coordinates of a cell).
+        dofs: Coordinates of this rank that belong to them.
+    """
+
+    def __init__(self, space: fem.FunctionSpace) -> None:
+        degree = compat.lagrange_degree(space)
+        assert degree is not None
+        self.space = compat.function_space(space.mesh, "DG", degree, (3,))
+        self.entries = EntriesOfCells(self.space)
+        nodes = compat.cell_dofs(space)[: self.entries.cells].astype(PETSc.IntType)
+        coordinates = 3 * nodes[:, :, None] + np.arange(3, dtype=PETSc.IntType)
+        self.dofs = coordinates.reshape(len(nodes), 3 * nodes.shape[1])
+        index_map = space.dofmap.index_map
+        self._size = 3 * (index_map.size_local + index_map.num_ghosts)
+
+    def add(self, matrix: PETSc.Mat, blocks: FloatArray, masks: Sequence[Any]) -> None:
+        """Add a block of each cell to a matrix of the body. Collective.
+
+        Args:
+            matrix: The matrix.
+            blocks: Shape (cells, coordinates of a cell, coordinates of a cell); changed.
+            masks: DOLFINx conditions whose rows and columns are left out.
+        """
+        free = np.ones(self._size)
+        for mask in masks:
+            free[mask.dof_indices()[0]] = 0.0
+        free = free[self.dofs]
+        blocks *= free[:, :, None] * free[:, None, :]
+        dofs, width = self.dofs, self.dofs.shape[1]
+        start = np.arange(dofs.size + 1, dtype=PETSc.IntType) * width
+        matrix.setValuesLocalIJV(
+            start, np.repeat(dofs, width, axis=0).ravel(), blocks.ravel(),
+            addv=PETSc.InsertMode.ADD_VALUES, rowmap=dofs.ravel(),
+        )  # fmt: skip
+        matrix.assemble()
+
+
+class WithinCells(Protocol):
+    """A linear form of displacements and of what follows from them within each cell."""
+
+    @property
+    def inner(self) -> FloatArray:
+        """What a step goes on from at its end, of this rank's cells, see `Body.inner`."""
+
+    def begin(self, inner: FloatArray | None) -> None:
+        """Set the state at t_n, as that of the displacement is; None: that of a body at rest."""
+
+    def move(self) -> None:
+        """Evaluate what follows from the displacement at t_{n+1}, which has been set."""
+
+    def add(self, values: FloatArray) -> None:
+        """Add the form to this rank's values, ghosts included."""
+
+    def add_to(self, matrix: PETSc.Mat, factor: float, masks: Sequence[Any]) -> None:
+        """Add what the displacement does through it, as evaluated last. Collective.
+
+        Args:
+            matrix: Derivative of the form with what is in the cells as it is.
+            factor: Of what is added.
+            masks: DOLFINx conditions whose rows and columns are left out.
+        """
+
+
 class FormWithMeans:
     """A linear form that holds means in cells, and its derivative by the displacement.
 
     Args:
+        means: What the form holds, none of them compiled.
         form: In UFL.
         w: Its test function, on the space of the displacements.
         unknown: The displacement.
-        means: What the form holds, none of them compiled.
     """
 
-    def __init__(self, form: Any, w: Any, unknown: Any, means: CellMeans) -> None:
-        self._means, space = means, w.ufl_function_space()
+    def __init__(self, means: CellMeans, form: Any, w: Any, unknown: Any) -> None:
+        self._means = means
         means.compile(unknown)
-        degree = compat.lagrange_degree(space)
-        assert degree is not None
-        # Entries of a linear form with such a test function are those of each cell alone.
-        broken = compat.function_space(space.mesh, "DG", degree, (3,))
-        apart, one = ufl.TestFunction(broken), fem.Function(means.space)
+        self._nodes = NodesOfCells(w.ufl_function_space())
+        apart, one = ufl.TestFunction(self._nodes.space), fem.Function(means.space)
         one.x.array[:] = 1.0
-        self._apart = EntriesOfCells(broken)
-        nodes = compat.cell_dofs(space)[: self._apart.cells].astype(PETSc.IntType)
-        coordinates = 3 * nodes[:, :, None] + np.arange(3, dtype=PETSc.IntType)
-        self._dofs = coordinates.reshape(len(nodes), 3 * nodes.shape[1])
-        index_map = space.dofmap.index_map
-        self._size = 3 * (index_map.size_local + index_map.num_ghosts)
         work = ufl.replace(form, {w: apart})
         pushes = [ufl.derivative(work, means.functions[k], one) for k in means.moving]
         self._form, *self._pushes = compile_forms([form, *pushes])
         self._derivatives = [means.derivatives(k, unknown, apart, one) for k in means.moving]
 
-    def evaluate(self, *, everything: bool = True) -> None:
-        """Evaluate the means; arguments as of `CellMeans`."""
-        self._means.evaluate(everything=everything)
+    @property
+    def inner(self) -> FloatArray:
+        """Nothing: means follow from the displacement alone."""
+        return np.empty(0)
+
+    def begin(self, inner: FloatArray | None) -> None:
+        """Evaluate all means."""
+        self._means.evaluate()
+
+    def move(self) -> None:
+        """Evaluate the means that the displacement at t_{n+1} changes."""
+        self._means.evaluate(everything=False)
 
     def add(self, values: FloatArray) -> None:
         """Add the form to this rank's values, ghosts included."""
         self._form.add(values)
 
     def add_to(self, matrix: PETSc.Mat, factor: float, masks: Sequence[Any]) -> None:
-        """Add what the displacement does through the means, as evaluated last. Collective.
-
-        Args:
-            matrix: Derivative of the form with the means as they are.
-            factor: Of what is added.
-            masks: DOLFINx conditions whose rows and columns are left out.
-        """
-        means, free = self._means, np.ones(self._size)
-        for mask in masks:
-            free[mask.dof_indices()[0]] = 0.0
-        free = free[self._dofs]
+        """As of `WithinCells`."""
+        means, of_nodes = self._means, self._nodes.entries
         rows: dict[int, FloatArray] = {}
-        added = np.zeros((*free.shape, free.shape[1]))
+        added: FloatArray | float = 0.0
         for k, of, forms in zip(means.moving, self._pushes, self._derivatives, strict=True):
-            push, row = self._apart(of), self._apart(forms[-1])
+            push, row = of_nodes(of), of_nodes(forms[-1])
             for j in forms.keys() - {-1}:
                 row += means.sums(forms[j]) * rows[j]
             rows[k] = row / means.volume[:, None]
-            added += (push * free)[:, :, None] * (factor * rows[k] * free)[:, None, :]
-        dofs, width = self._dofs, self._dofs.shape[1]
-        start = np.arange(dofs.size + 1, dtype=PETSc.IntType) * width
-        matrix.setValuesLocalIJV(
-            start, np.repeat(dofs, width, axis=0).ravel(), added.ravel(),
-            addv=PETSc.InsertMode.ADD_VALUES, rowmap=dofs.ravel(),
-        )  # fmt: skip
-        matrix.assemble()
+            added = added + push[:, :, None] * (factor * rows[k])[:, None, :]
+        self._nodes.add(matrix, np.asarray(added), masks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,21 +16,24 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
-from dolfinx_nts.bodies.solid.cell_means import CellMeans
+from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
+from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans, NodesOfCells
 from dolfinx_nts.bodies.solid.materials import bulk_over_shear, misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.solid.stress_jumps import StressJumps
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, global_sum, raise_together
-from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
+from dolfinx_nts.parallel import anywhere, global_max, global_sum, raise_together
+from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
     items,
     known_options,
+    require_bool,
     require_name,
     require_one_of,
     vector_in_time,
@@ -42,6 +45,8 @@ _STRESS_FREE = 1e-6
 _SMALL_STRAIN = 1e-4
 #: Bulk over shear modulus from which on cells of degree 1 lock in any motion (nu = 0.499).
 _INCOMPRESSIBLE = 500.0
+#: Least eigenvalue of C from which on cells with modes are stable (0.48 at nu = 0.4999).
+_FOLDS = 0.56
 #: Largest spread of a body's nodes over the least from which on it may bend: a bar or plate of one
 #: cell over the thickness is some 4 times as long as thick.
 _THIN = 2.3
@@ -79,6 +84,10 @@ class Continuum(UflBody):
         allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
             quadrature point, with a warning in the Solution; else such a step is cut, and the
             run stops where that does not help. W(C) cannot see it.
+        bending: Let hexahedra of degree 1 bend as thin parts do, without the shear that makes them
+            too stiff: by three vectors within each cell, which follow from the displacement and
+            from the step before (theory 19.4). For thin and stiff parts; where a cell is compressed
+            to about 0.6 of a length it may fold, which a run warns of.
         volume: "projected": W takes the change of volume of each cell in the mean, so that cells do
             not lock where the material hardly changes its volume (nu near 0.5), and bend more
             easily; for hexahedra of degree 1. "full": W at each point, as it is.
@@ -116,31 +125,14 @@ class Continuum(UflBody):
         extra_form: ExtraForm | None = None,
         allow_inversion: bool = False,
         volume: str = "full",
+        bending: bool = False,
     ) -> None:
-        if not callable(material):
-            raise TypeError(
-                f"material={material!r}: pass a callable C -> W(C), "
-                "e.g. NeoHookean(young=1e6, poisson=0.3)"
-            )
-        require_positive_parameter("density", density, "kg/m^3")
-        for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
-            if value is not None and not (is_whole(value) and value > 0):
-                raise ValueError(f"{option}={value!r}: must be a positive integer")
+        _check_material(material, density)
         require_name("name", name)
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         least = check_mesh(mesh, name)
-        degree = degree or least
-        if degree < least:
-            raise ValueError(
-                f"degree={degree!r} of {name!r}: its mesh is of degree {least}; leave degree out, "
-                "or pass nts.linear(mesh)"
-            )
-        require_one_of("volume", volume, ("full", "projected"))
-        if volume == "projected" and (degree != 1 or compat.cell_name(mesh) != "hexahedron"):
-            raise ValueError(
-                f"volume={volume!r} of {name!r}: is for hexahedra of degree 1, not for "
-                f"{compat.cell_name(mesh)}s of degree {degree}; use volume='full'"
-            )
+        degree = _checked_degree(degree, quadrature_degree, least, name)
+        _check_cells(mesh, degree, name, volume, bending)
         quadrature_degree = quadrature_degree or 2 * degree
         super().__init__(
             compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
@@ -160,9 +152,13 @@ class Continuum(UflBody):
         self._rho = self._density(density)
         self.law = strain_energy(with_constants(material, self.mesh))
         self._volume = volume
+        self._modes = BendingModes(mesh) if bending else None
+        self.has_inner = bending
+        #: Modes of the state that `u` and `v` are of.
+        self._bent = None if self._modes is None else fem.Function(self._modes.space)
         self._check_energy()
         law, means = self.energy()
-        energy, load = law(green_strain(ufl.grad(self.u))), self._load_in_ufl()
+        energy, load = law(green_strain(self.gradient)), self._load_in_ufl()
         (self._load_form,) = self._set_forms(energy * self._dx, load, means=means)
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
@@ -210,6 +206,12 @@ class Continuum(UflBody):
         shear = means.mean(shear_modulus(self.law), given=True)
         return ProjectedVolume(self.law, shear, means.mean), means
 
+    @property
+    def gradient(self) -> Any:
+        """Displacement gradient in UFL that W takes at the state of `u`."""
+        h = ufl.grad(self.u)
+        return h if self._modes is None else h + self._modes.gradient(self._bent)
+
     def _check_energy(self) -> None:
         """Raise on every rank if something is wrong with W."""
         problem, cause = None, None
@@ -241,7 +243,15 @@ class Continuum(UflBody):
     def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
         (law, means), h0, h1 = self.energy(), ufl.grad(u0), ufl.grad(u1)
-        return ufl.inner(rule.piola(law, h0, h1), ufl.grad(w)) * self._dx, means
+        if self._modes is not None:
+            step = StepModes(self._modes)
+            h0, h1 = (h + self._modes.gradient(w) for h, w in ((h0, step.old), (h1, step.new)))
+            stress = rule.piola(law, h0, h1)
+            return ufl.inner(stress, ufl.grad(w)) * self._dx, partial(
+                step.compiled, stress, self._dx
+            )
+        work = ufl.inner(rule.piola(law, h0, h1), ufl.grad(w)) * self._dx
+        return work, None if means is None else partial(FormWithMeans, means)
 
     # ---- as of Body
     @property
@@ -249,14 +259,14 @@ class Continuum(UflBody):
         """What ranks must have in common, see `Body`."""
         loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
-        own["volume"] = self._volume
+        own |= {"volume": self._volume, "bending": self._modes is not None}
         return own | loads | super().settings
 
     def stress_jumps(self) -> FloatArray:
         """As of `Body`."""
         if self._jumps is None:
             law, means = self.energy()
-            stress = law.at_point(green_strain(ufl.grad(self.u)))
+            stress = law.at_point(green_strain(self.gradient))
             if means is not None:
                 means.compile(self.u)
             self._jumps = StressJumps(stress, self.mesh, self._dx), means
@@ -270,8 +280,10 @@ class Continuum(UflBody):
         """As of `Body`."""
         if self._linear and compat.cell_name(self.mesh) == "tetrahedron":
             return "use degree=2, hexahedra, or a finer mesh"
+        if self._modes is not None:
+            return "use degree=2, or a finer mesh"
         if self._linear and self._volume == "full":
-            return "use volume='projected', or a finer mesh"
+            return "use volume='projected', bending=True in thin and stiff parts, or a finer mesh"
         return "use a finer mesh"
 
     @property
@@ -287,7 +299,7 @@ class Continuum(UflBody):
     @cached_property
     def is_thin(self) -> bool:  # type: ignore[override]
         """As of `Body`."""
-        if not self._linear:
+        if not self._linear or self._modes is not None:
             return False
         x = self.reference.reshape(-1, 3)
         count = global_sum(self.comm, np.array([float(len(x))]))
@@ -301,6 +313,48 @@ class Continuum(UflBody):
         on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
         inside = len(x) - np.count_nonzero(np.unique(on_boundary) < len(x))
         return not anywhere(self.comm, bool(inside))
+
+    def inner(self, u1: FloatArray) -> FloatArray:
+        """As of `Body`: the modes of the cells, shape (9 cells,)."""
+        return self._forms.inner(u1)
+
+    def take_inner(self, inner: FloatArray) -> None:
+        """As of `Body`."""
+        if self._bent is not None:
+            self._bent.x.array[: len(inner)] = inner
+
+    @property
+    def inner_at_start(self) -> FloatArray:
+        """As of `Body`: in equilibrium with the displacement that it starts in."""
+        if self._modes is None:
+            return np.empty(0)
+        return self._forms.inner_at_rest(self.initial_displacement)
+
+    def doubts(self, u: FloatArray) -> list[StepWarning]:
+        """As of `Body`: where cells with modes may fold (theory 19.4)."""
+        if self._modes is None:
+            return []
+        corners = self._forms.with_ghosts(u)[self._nodes_of_cells.dofs]
+        least = -float(global_max(self.comm, np.array([-self._modes.least_stretch(corners)]))[0])
+        if least >= _FOLDS:
+            return []
+        text = (
+            f"a cell of body {self.name!r} is compressed to {math.sqrt(max(least, 0.0)):.2g} of a "
+            "length, where bending=True lets it fold for nothing; leave bending out, or pass "
+            "degree=2"
+        )
+        return [StepWarning("folding cells", _FOLDS - least, text, (self.name,))]
+
+    @cached_property
+    def _nodes_of_cells(self) -> NodesOfCells:
+        return NodesOfCells(self.space)
+
+    @property
+    def inner_numbers(self) -> IntArray:
+        """As of `Body`: those of the cells in the input."""
+        topology = self.mesh.topology
+        owned = topology.index_map(topology.dim).size_local
+        return np.asarray(topology.original_cell_index[:owned], dtype=np.int64)
 
     def destroy(self) -> None:
         """As of `Body`."""
@@ -345,3 +399,51 @@ class Continuum(UflBody):
             (value, vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit))
             for name, value, unit in given
         ]
+
+
+def _check_material(material: Any, density: Parameter) -> None:
+    if not callable(material):
+        raise TypeError(
+            f"material={material!r}: pass a callable C -> W(C), "
+            "e.g. NeoHookean(young=1e6, poisson=0.3)"
+        )
+    require_positive_parameter("density", density, "kg/m^3")
+
+
+def _checked_degree(
+    degree: int | None, quadrature_degree: int | None, least: int, name: str
+) -> int:
+    """The polynomial degree, by default that of the mesh."""
+    for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
+        if value is not None and not (is_whole(value) and value > 0):
+            raise ValueError(f"{option}={value!r}: must be a positive integer")
+    degree = degree or least
+    if degree < least:
+        raise ValueError(
+            f"degree={degree!r} of {name!r}: its mesh is of degree {least}; leave degree out, "
+            "or pass nts.linear(mesh)"
+        )
+    return degree
+
+
+def _check_cells(mesh: Mesh, degree: int, name: str, volume: str, bending: bool) -> None:
+    """Raise unless cells can have what keeps them from locking."""
+    require_one_of("volume", volume, ("full", "projected"))
+    require_bool("bending", bending)
+    kind = compat.cell_name(mesh)
+    plain = degree == 1 and kind == "hexahedron"
+    if volume == "projected" and not plain:
+        raise ValueError(
+            f"volume={volume!r} of {name!r}: is for hexahedra of degree 1, not for {kind}s of "
+            f"degree {degree}; use volume='full'"
+        )
+    if bending and not plain:
+        raise ValueError(
+            f"bending={bending!r} of {name!r}: is for hexahedra of degree 1, not for {kind}s of "
+            f"degree {degree}; use degree=2, which bends without it"
+        )
+    if bending and volume == "projected":
+        raise ValueError(
+            f"bending={bending!r}, volume={volume!r} of {name!r}: the volume of a cell in the "
+            "mean would undo its bending; pass one of the two"
+        )

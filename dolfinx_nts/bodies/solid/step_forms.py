@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans
+from dolfinx_nts.bodies.solid.cell_means import WithinCells
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -70,6 +70,12 @@ def check_extra_form(body: Any, extra_form: ExtraForm, w: Any) -> None:
     )  # fmt: skip
 
 
+#: See `StepForms`.
+VirtualWork = Callable[
+    [Integrator, Any, Any, Any], tuple[Any, Callable[[Any, Any, Any], WithinCells] | None]
+]
+
+
 class StepForms:
     """What a body's energy does in a step, compiled once for each integrator.
 
@@ -78,7 +84,8 @@ class StepForms:
     Args:
         space: Function space of the displacements.
         virtual_work: The internal virtual work in UFL by an integrator, between two displacements:
-            (rule, u0, u1, w) -> form, and the means that it holds, or None.
+            (rule, u0, u1, w) -> form, and None or what makes of (form, w, u1) the form with all
+            that it holds within cells.
         mass: Kinetic energy's second derivative in UFL, (v, w) -> form.
         extra: As `extra_form` of `Continuum`.
         check_alive: Raises an error once the body was destroyed.
@@ -87,14 +94,14 @@ class StepForms:
     def __init__(
         self,
         space: fem.FunctionSpace,
-        virtual_work: Callable[[Integrator, Any, Any, Any], tuple[Any, CellMeans | None]],
+        virtual_work: VirtualWork,
         mass: MassForm,
         extra: ExtraForm | None,
         check_alive: Callable[[], None],
     ) -> None:
         self._check_alive = check_alive
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
-        self._forms: dict[Integrator, tuple[Any, Any, Any, FormWithMeans | None]] = {}
+        self._forms: dict[Integrator, tuple[Any, Any, Any, WithinCells | None]] = {}
         self._u0, self._u1, self._drift = (fem.Function(space) for _ in range(3))
         # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their counts
         # as text, and a form would be compiled again where 9 and 10 meet.
@@ -112,12 +119,12 @@ class StepForms:
 
     def begin(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
-        self._work, self._tangent, self._extra_work, self._means = self._compiled(rule)
+        self._work, self._tangent, self._extra_work, self._cells = self._compiled(rule)
         if self._matrix is None:
             self._matrix = petsc_compat.create_matrix(self._tangent)
         fill(self._u0, moment.u0)
-        if self._means is not None:
-            self._means.evaluate()
+        if self._cells is not None:
+            self._cells.begin(moment.inner)
         if self._extra is not None:
             self._rate.value, self._time.value = moment.rate, moment.time
             if moment.drift is not None:
@@ -150,39 +157,59 @@ class StepForms:
         self._move_to(u1)
         self._factors.value = mass, stiffness
         petsc_compat.assemble_matrix(self._matrix, self._tangent, masks, diagonal)
-        if self._means is not None:
-            self._means.add_to(self._matrix, stiffness, masks)
+        if self._cells is not None:
+            self._cells.add_to(self._matrix, stiffness, masks)
         return self._matrix
 
     def _move_to(self, u1: FloatArray) -> None:
-        """Set the displacement at t_{n+1}, and the means there."""
+        """Set the displacement at t_{n+1}, and what follows from it within cells."""
         fill(self._u1, u1)
-        if self._means is not None:
-            self._means.evaluate(everything=False)
+        if self._cells is not None:
+            self._cells.move()
+
+    def inner(self, u1: FloatArray) -> FloatArray:
+        """What the next step goes on from within cells, see `Body.inner`."""
+        if self._cells is None:
+            return np.empty(0)
+        self._move_to(u1)
+        return self._cells.inner
+
+    def inner_at_rest(self, u: FloatArray) -> FloatArray:
+        """What is within cells in equilibrium at a displacement, as of `inner`."""
+        *_, cells = self._compiled(EQUILIBRIUM)
+        if cells is None:
+            return np.empty(0)
+        for function in (self._u0, self._u1):
+            fill(function, u)
+        cells.begin(None)
+        cells.move()
+        return cells.inner
 
     def forces(self, rule: Integrator, u0: FloatArray, u1: FloatArray) -> FloatArray:
         """Internal forces by a rule between two displacements [N]; set the state anew after it."""
-        work, *_, means = self._compiled(rule)
+        work, *_, cells = self._compiled(rule)
         fill(self._u0, u0)
         fill(self._u1, u1)
-        if means is not None:
-            means.evaluate()
+        if cells is not None:
+            cells.begin(None)
+            cells.move()
         return self.assemble(work)
 
     def stiffness_at_rest(self) -> FloatArray:
         """Diagonal of the tangent in equilibrium, without deformation [N/m]."""
-        _, tangent, _, means = self._compiled(EQUILIBRIUM)
+        _, tangent, _, cells = self._compiled(EQUILIBRIUM)
         kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
         for u in (self._u0, self._u1):
             u.x.array[:] = 0.0
         self._factors.value, self._rate.value = (0.0, 1.0), 0.0
         # The matrix of the step may be kept from an earlier one.
         matrix = petsc_compat.create_matrix(tangent)
-        if means is not None:
-            means.evaluate()
+        if cells is not None:
+            cells.begin(None)
+            cells.move()
         petsc_compat.assemble_matrix(matrix, tangent, (), 0.0)
-        if means is not None:
-            means.add_to(matrix, 1.0, ())
+        if cells is not None:
+            cells.add_to(matrix, 1.0, ())
         diagonal = matrix.getDiagonal()
         found: FloatArray = diagonal.array_r.copy()
         for petsc_object in (diagonal, matrix):
@@ -218,11 +245,11 @@ class StepForms:
             if a is not None:
                 a.destroy()
 
-    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any, FormWithMeans | None]:
-        """Internal virtual work, tangent, extra virtual work and means in cells by a rule."""
+    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any, WithinCells | None]:
+        """Internal virtual work, tangent, extra virtual work and what is in cells by a rule."""
         if rule not in self._forms:
             du, w = ufl.TrialFunction(self._space), ufl.TestFunction(self._space)
-            work, means = self._virtual_work(rule, self._u0, self._u1, w)
+            work, with_cells = self._virtual_work(rule, self._u0, self._u1, w)
             virtual, extra = work, None
             if self._extra is not None:
                 moved = self._u1 - self._u0
@@ -235,11 +262,11 @@ class StepForms:
             tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
             if rule.inertia:
                 tangent += self._factors[0] * self._mass(du, w)
-            together = None if means is None else FormWithMeans(work, w, self._u1, means)
-            own = [work] if together is None else []
+            cells = None if with_cells is None else with_cells(work, w, self._u1)
+            own = [work] if cells is None else []
             *own, made = compile_forms([*own, tangent])
             of_extra = None if extra is None else compile_forms([extra])[0]
-            self._forms[rule] = (own or [together])[0], made, of_extra, together
+            self._forms[rule] = (own or [cells])[0], made, of_extra, cells
         return self._forms[rule]
 
 

@@ -71,7 +71,7 @@ def von_mises(body: Any, *, at: str = "nodes") -> Any:
 
 def _cauchy(body: Any) -> tuple[Any, CellMeans | None]:
     """Cauchy stress in UFL, and the cells' means that it holds."""
-    h = ufl.grad(body.u)
+    h = body.gradient
     law, means = body.energy()
     f = ufl.Identity(3) + h
     stress = f * law.stress(green_strain(h)) * f.T / ufl.det(f)

@@ -101,10 +101,8 @@ class UflBody(MeshBody):
         if self._given_density is not None:
             require_positive_parameter("density", self._given_density, "kg/m^d")
 
-    def _virtual_work(
-        self, rule: Integrator, u0: Any, u1: Any, w: Any
-    ) -> tuple[Any, CellMeans | None]:
-        """Internal virtual work between two displacements by a rule in UFL, and means in it."""
+    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
+        """Internal virtual work between two displacements, as of `StepForms`."""
         raise NotImplementedError
 
     @cached_property
