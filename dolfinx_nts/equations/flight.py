@@ -28,6 +28,8 @@ class Flight:
     Attributes:
         ends: Displacement of each batch at t_{n+1} [m].
         momentum: M (u_1 - u_0) of each batch [kg m]; zero in statics.
+        jumps: In statics, how far prescribed coordinates of each batch go beside what its motion
+            would have them do [m], in the order of `fixed`.
     """
 
     def __init__(
@@ -38,6 +40,7 @@ class Flight:
         self._supports, self._lengths = supports, lengths
         self.ends: list[FloatArray] = []
         self.momentum: list[FloatArray] = []
+        self.jumps: list[FloatArray] = []
 
     def begin(self, state: State, u0: Sequence[FloatArray], dt: float) -> BoolArray:
         """Fly from the state at t_n, displacements u0 of each batch [m]. Collective.
@@ -49,8 +52,11 @@ class Flight:
         v0, a0 = batches.rates(state)
         ahead = [integrator.ahead(v, a, dt) for v, a in zip(v0, a0, strict=True)]
         self.ends = [u + du for u, du in zip(u0, ahead, strict=True)]
+        self.jumps = []
         for body, u1 in zip(batches.bodies, self.ends, strict=True):
-            u1[body.fixed] = body.prescribed(state.time + dt)
+            there = body.prescribed(state.time + dt)
+            self.jumps.append(there - u1[body.fixed])
+            u1[body.fixed] = there
         self._supports.begin(state, batches.split(self.ends), dt)
         rates = [v0] + [[dt * a for a in a0 if a is not None]] * bool(state.a)
         speed = self._lengths.begin(u0, rates, self.ends)

@@ -23,6 +23,7 @@ from dolfinx_nts.equations.body_tangents import BodyTangents
 from dolfinx_nts.equations.couplings import Couplings
 from dolfinx_nts.equations.flight import Flight
 from dolfinx_nts.equations.loads import Loads
+from dolfinx_nts.equations.mass_solves import Saddle
 from dolfinx_nts.equations.scales import Lengths, Rounding, stiffness_between
 from dolfinx_nts.equations.shared_weight import SharedWeight
 from dolfinx_nts.equations.sleep import Sleepers
@@ -35,6 +36,11 @@ from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
+
+#: A motion of supports goes on as before if it differs by less than this part.
+_STEADY = 1e-6
+#: Part of a motion of supports that tells which forces it makes.
+_TRIED = 1e-3
 
 
 class StepProblem:
@@ -130,6 +136,8 @@ class StepProblem:
         self._evaluated, self._u0 = {}, self.batches.join(state.u)
         self.loads.begin(state, dt, moments)
         at_rest = self.flight.begin(state, self._u0, dt)
+        if not self.integrator.inertia:
+            self._follow_supports()
         lengths, first = self.lengths, self.flight.ends
         way = [a - b for a, b in zip(first, self._u0, strict=True)]
         if again is not None:
@@ -148,6 +156,31 @@ class StepProblem:
         if self._sleep and sleep:
             self.sleepers.find(at_rest & (lengths.motion == 0.0), state.u, self.rounding)
         self._lay_out(again)
+
+    def _follow_supports(self) -> None:
+        """Let bodies follow what supports do beside their motion, in the first guess. Collective.
+
+        Else the cells at the supports would take all of it: those of a material that hardly changes
+        its volume have no way back from there.
+        """
+        for j, body in enumerate(self.batches.bodies):
+            if not body.driven:
+                continue
+            u0, end, jump = self._u0[j], self.flight.ends[j], np.zeros(body.num_owned)
+            jump[body.fixed] = self.flight.jumps[j]
+            sizes = np.array([np.abs(a).max(initial=0.0) for a in (jump, end - u0)])
+            largest, moved = global_max(self.system.comm, sizes)
+            if not largest > _STEADY * moved:
+                continue
+            pull = (body.internal(u0 + _TRIED * jump) - body.internal(u0)) / _TRIED
+            pull[body.fixed] = 0.0
+            saddle = Saddle(self.tangents.of_all(j, u0))
+            way = saddle.solve(-pull)
+            saddle.destroy()
+            way[body.fixed] = 0.0
+            far = global_max(self.system.comm, np.abs(way).max(initial=0.0, keepdims=True))[0]
+            if far <= self.lengths.radius:
+                end += way
 
     @property
     def elements(self) -> list[Any]:

@@ -27,6 +27,8 @@ from scenes import (
 from scipy.optimize import fsolve
 
 import dolfinx_nts as nts
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.integrators import Static
 from dolfinx_nts.output import BalanceCSV, Fields
 
 COMM = MPI.COMM_WORLD
@@ -943,3 +945,39 @@ def test_virtual_work_that_is_not_finite_is_told():
     )  # fmt: skip
     run = nts.equilibrium(nts.System([body]), load_steps=1)
     assert "the external forces of 'body' are not finite: check its loads" in run.status
+
+
+# ---- where supports move
+@pytest.mark.mpi
+def test_a_body_follows_its_supports_in_the_first_guess():
+    """Of a small motion the guess is the solution.
+
+    Rubber that its own first layer of cells had to yield to could not be solved for at once.
+    """
+    moves = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, lambda t: (1e-7 * t, 2e-7 * t, -1e-7 * t))
+    body = nts.Continuum(
+        box([0, 0, 0], [1, 1, 0.5], [4, 4, 3]), nts.NeoHookean(young=1e6, poisson=0.4999),
+        density=1e3, bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9), moves],
+    )  # fmt: skip
+    system = nts.System([body])
+    problem = StepProblem(system, Static(), rtol=1e-8, condense=True)
+    problem.begin(system.initial_state(), 1.0)
+    guess = problem.evaluate(problem.x).bodies[0].u1.copy()
+    run = nts.equilibrium(system, load_steps=1)
+    off = COMM.allreduce(np.abs(guess - run.state.u[0]).max(initial=0.0), op=MPI.MAX)
+    assert off < 1e-5 * 1e-7
+
+
+@pytest.mark.mpi
+def test_rubber_is_pressed_by_its_supports_in_few_steps():
+    """A bonded block, by an eighth of its height in two load steps, none of them cut."""
+    mesh = box([0, 0, 0], [1, 1, 0.5], [4, 4, 3])
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.4999), density=1e3, volume="projected",
+        bcs=[
+            nts.Dirichlet(lambda x: x[2] < 1e-9),
+            nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, lambda t: (0.0, 0.0, -0.0625 * t)),
+        ],
+    )  # fmt: skip
+    run = nts.equilibrium(nts.System([body]), load_steps=2)
+    assert run.status == "completed" and run.retries == 0
