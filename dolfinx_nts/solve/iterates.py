@@ -9,6 +9,7 @@ from dolfinx_nts.contact.contact_law import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
+from dolfinx_nts.solve.rubbing_joints import RubbingJoints
 from dolfinx_nts.types import IntArray
 
 #: Iterations in a row without fewer changes of the active set before one changes at a time.
@@ -25,12 +26,14 @@ class Iterates:
     Attributes:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.
+        led: How many iterates of the attempt friction of joints has led, see `RubbingJoints`.
         imposed: Whether the last iterate was evaluated with contacts that its laws would change.
         runs_away: Whether nodes that hardly rub slid so far that friction must be what holds them.
     """
 
     def __init__(self, problem: StepProblem) -> None:
         self._problem, self._sliding = problem, 0
+        self._joints = RubbingJoints(problem)
         self.restart()
 
     def restart(self) -> None:
@@ -40,6 +43,8 @@ class Iterates:
         self.imposed, self._settled, self._pivots = False, True, False
         self._fewest, self._patience = np.inf, _PATIENCE
         self.runs_away = False
+        self.led = 0
+        self._joints.restart()
         self._rub_by_law()
 
     def slide_first(self) -> None:
@@ -63,6 +68,8 @@ class Iterates:
         self.last, self.imposed, self.runs_away = None, False, False
         self._pivots = pivots and self._problem.integrator.inertia
         self._fewest, self._patience = np.inf, _PATIENCE
+        self.led = 0
+        self._joints.try_again()
 
     def at(self, x: PETSc.Vec) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one. Collective."""
@@ -79,6 +86,10 @@ class Iterates:
             new = self._pivoted(last, new, x)
         if self._sliding:
             new = self._slid(last, new, x)
+        if last is not None and self._problem.couplings.rubbing:
+            new, led = self._joints.at(last, new, x)
+            self.led += led
+            self.imposed |= led
         self._settled = not self.imposed
         if last is None:
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
