@@ -139,9 +139,9 @@ class Iterates:
         Inertia holds what slides, and what is fast slides far.
         """
         contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
-        both = zip(contacts.elements, e.parts, strict=False)
+        least, both = _FARTHER * self._slid_by, zip(contacts.elements, e.parts, strict=False)
         far = [
-            (part.distance > np.maximum(share * c.candidates.length, _FARTHER * self._slid_by)).any()
+            (part.distance > np.maximum(share * c.candidates.length, least)).any()
             for c, part in both
         ]
         self.runs_away = anywhere(comm, any(far)) and not self._problem.integrator.inertia
