@@ -244,14 +244,33 @@ class ContactLaw(Batch):
 
     # ---- an iterate
     def misses(self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
-        """Sum and number of the forces that press [kg m], largest gap and slip of these [m]."""
+        """Sum and number of the forces that press [kg m], largest gap of these and slip [m].
+
+        The slip is that of pairs that are to stick: what others slip is not missed, and does not
+        vanish in the solution.
+        """
         force = multiplier[:, 0]
         on = (force < 0.0) | (gap < 0.0)
+        missed = 0.0
+        if slip is not None:
+            stick = on & ~self._slides(gap, slip, multiplier)
+            missed = np.abs(slip.value[stick]).max(initial=0.0)
         return np.array([
             -force[on].clip(max=0.0).sum(), np.count_nonzero(force[on] < 0.0),
-            np.abs(gap[on]).max(initial=0.0),
-            0.0 if slip is None else np.abs(slip.value[on]).max(initial=0.0),
+            np.abs(gap[on]).max(initial=0.0), missed,
         ])  # fmt: skip
+
+    def _slides(self, gap: FloatArray, slip: Slip, multiplier: FloatArray) -> BoolArray:
+        """Which pairs that share nodes are beyond Coulomb's bound, as the kernel has it."""
+        if self.endless:
+            return np.zeros(len(gap), dtype=bool)
+        force = np.where(multiplier[:, 0] < 0.0, -multiplier[:, 0], -self.yielding * gap)
+        pushed = np.matmul(slip.metric, slip.value[:, :, None])[:, :, 0]
+        trial = multiplier[:, -2:] + self.tangential_scale[:, None] * pushed
+        (a, b), (_, c) = slip.metric.transpose(1, 2, 0)
+        square = c * trial[:, 0] ** 2 - 2.0 * b * trial[:, 0] * trial[:, 1] + a * trial[:, 1] ** 2
+        slides: BoolArray = square > (a * c - b**2) * (self.coefficient * force.clip(min=0.0)) ** 2
+        return slides
 
     @cached_property
     def _kernel(self) -> tuple[Any, list[Any]]:

@@ -407,8 +407,8 @@ class ContactSearch:
         return any(0.0 < pair.friction < np.inf for pair in self._pairs)
 
     def carried_any(self) -> bool:
-        """Whether any node pressed at t_n. Collective."""
-        return anywhere(self._comm, any((old.force > 0.0).any() for old in self._old))
+        """Whether any node presses where the step begins or goes on from. Collective."""
+        return anywhere(self._comm, any((old.force > 0.0).any() for old in self._carried))
 
     @contextmanager
     def imposed(self, active: Sequence[BoolArray], *, stick: bool = False) -> Iterator[None]:

@@ -19,6 +19,7 @@ from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Coupling, JointCoupling
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.interaction.measured import Measured, MeasuredPart, rubs
 from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
@@ -132,6 +133,15 @@ class Couplings:
                 part: Any = e.parts[start]
                 yield k, batch, part
                 start += 1
+
+    @property
+    def rubbing(self) -> list[Measured]:
+        """Those of joints that stick and slip."""
+        return [coupling for coupling, _ in self.joints if rubs(coupling)]
+
+    def of_rubbing(self, e: Evaluation) -> list[MeasuredPart]:
+        """Parts of an evaluation, of each of `rubbing`."""
+        return [parts[0] for coupling, _, parts in self.of_joints(e) if rubs(coupling)]
 
     def forget_solution(self) -> None:
         """Guess contact forces of t_n again, where those of a solution of the step led nowhere."""

@@ -10,8 +10,8 @@ integrator has no discrete gradients, the gradient is that of the place where it
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol, TypeGuard
 
 import numpy as np
 
@@ -133,6 +133,25 @@ class HoldingLaw(Protocol):
         """
 
 
+class Rubs(HoldingLaw, Protocol):
+    """A law that sticks and slips, with what leads Newton's method to it."""
+
+    def blurred(self, width: float) -> HoldingLaw:
+        """A law close to it, without a step between stick and slip below a width of slip [m]."""
+
+    def parted(self, held: BoolArray) -> HoldingLaw:
+        """The law of what sticks where told so, shape (n,), and slips on elsewhere."""
+
+    def unlike(self, slip: FloatArray, pull: FloatArray, width: float) -> FloatArray:
+        """What a force D misses of the blurred law, over the largest one, shape (n,).
+
+        Args:
+            slip: Change of the measure as a length [m], shape (n,).
+            pull: D, shape (n,).
+            width: Of the blurred law [m].
+        """
+
+
 class MeasuredPart(NamedTuple):
     """What a measure under a law contributes, see `Part`.
 
@@ -248,6 +267,11 @@ class MeasuredElements(PointElements):
             work = pull * (at_end - self.since)
         return MeasuredPart(residual, tangent, status, memory, work)
 
+    def slip(self, part: MeasuredPart) -> FloatArray:
+        """Change of the measure in the step as a length [m], shape (n,)."""
+        slip: FloatArray = self.measure.length * (part.memory[:, 0] - self.since)
+        return slip
+
     def largest(self, part: MeasuredPart) -> list[float]:
         """The largest row of its multiplier [m], and its extent."""
         rows = np.abs(self.rows(part, "constraints")).max(initial=0.0)
@@ -267,6 +291,11 @@ class MeasuredElements(PointElements):
 def holds(law: Any) -> bool:
     """Whether a law holds its force as a multiplier."""
     return hasattr(law, "row")
+
+
+def rubs(coupling: Any) -> TypeGuard[Measured]:
+    """Whether a coupling is of a law that sticks and slips, see `Rubs`."""
+    return isinstance(coupling, Measured) and hasattr(coupling.law, "blurred")
 
 
 class Measured(EveryStep):
@@ -300,6 +329,15 @@ class Measured(EveryStep):
             drift=measure.nodal(velocity), near=near, since=since, entry=joint.entry,
             scale=scale,
         )  # fmt: skip
+
+    @property
+    def law(self) -> Any:
+        """That of the joint."""
+        return self._joint.law
+
+    def obey(self, law: HoldingLaw) -> None:
+        """Let the elements of the step obey another law."""
+        self.elements = [replace(batch, law=law) for batch in self.elements]
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """The multiplier of the last step."""

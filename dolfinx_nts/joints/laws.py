@@ -14,7 +14,7 @@ import numpy as np
 from dolfinx_nts.interaction.measured import Move, Row
 from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.kernels import measures as kernel
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray
 from dolfinx_nts.validation import (
     call_together,
     direction,
@@ -52,23 +52,49 @@ class JointFriction:
 
 
 class Bound(NamedTuple):
-    """The measure rests while |D| <= bound, else D = bound against its motion."""
+    """The measure rests while |D| <= bound, else D = bound against its motion.
+
+    Attributes:
+        bound: Of D.
+        width: As of `Rubs.blurred`; 0: the law itself.
+        held: As of `Rubs.parted`; None: as the law says.
+    """
 
     bound: float
+    width: float = 0.0
+    held: BoolArray | None = None
 
     @property
     def settings(self) -> Mapping[str, Any]:
         """The bound."""
-        return self._asdict()
+        return {"bound": self.bound}
 
     def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:
         """Stick c_1 = c_0, or D = bound sign(c_1 - c_0), by the trial D + c_1 - c_0."""
         slip, most = end - start, self.bound / unit
-        trial = force + slip
-        stick = np.abs(trial) <= most
+        trial = slip if self.held is not None else force + slip
+        stick = np.abs(trial) <= most if self.held is None else self.held
+        if self.width:
+            # D times the root is bound times the slip: linear in D, which counts as within its
+            # bound in the slope.
+            size = np.hypot(slip, self.width)
+            slope = (np.clip(force, -most, most) * slip / size - most) / size
+            return Row(force - most * slip / size, slope, np.ones_like(slip), stick)
         slides = force - most * np.sign(trial)
         on, off = stick.astype(float), (~stick).astype(float)
         return Row(np.where(stick, slip, slides), on, off, stick)
+
+    def blurred(self, width: float) -> Bound:
+        """D = bound s/sqrt(s^2 + width^2) of the slip s."""
+        return self._replace(width=width)
+
+    def parted(self, held: BoolArray) -> Bound:
+        """What sticks is told."""
+        return self._replace(held=held)
+
+    def unlike(self, slip: FloatArray, pull: FloatArray, width: float) -> FloatArray:
+        """What D misses of the blurred law, over its bound."""
+        return pull / self.bound - slip / np.hypot(slip, width)
 
 
 class Limits(NamedTuple):

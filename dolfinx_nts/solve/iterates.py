@@ -9,6 +9,7 @@ from dolfinx_nts.contact.contact_law import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
+from dolfinx_nts.solve.rubbing_joints import RubbingJoints
 from dolfinx_nts.types import IntArray
 
 #: Iterations in a row without fewer changes of the active set before one changes at a time.
@@ -17,6 +18,9 @@ _PATIENCE = 4
 _TO_AND_FRO = 4
 #: Iterations at most in which nodes hardly rub.
 _SLIDING = 8
+#: Nodes that slip run away if they do so by more than this part of a facet and by so many times
+#: what they have slid where they hardly rubbed.
+_FAR, _FARTHER = 0.25, 2.0
 
 
 class Iterates:
@@ -25,12 +29,14 @@ class Iterates:
     Attributes:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.
+        led: How many iterates of the attempt friction of joints has led, see `RubbingJoints`.
         imposed: Whether the last iterate was evaluated with contacts that its laws would change.
         runs_away: Whether nodes that hardly rub slid so far that friction must be what holds them.
     """
 
     def __init__(self, problem: StepProblem) -> None:
         self._problem, self._sliding = problem, 0
+        self._joints = RubbingJoints(problem)
         self.restart()
 
     def restart(self) -> None:
@@ -39,7 +45,9 @@ class Iterates:
         self.flips: list[IntArray] = []
         self.imposed, self._settled, self._pivots = False, True, False
         self._fewest, self._patience = np.inf, _PATIENCE
-        self.runs_away = False
+        self.runs_away, self._slid_by = False, 0.0
+        self.led = 0
+        self._joints.restart()
         self._rub_by_law()
 
     def slide_first(self) -> None:
@@ -47,7 +55,7 @@ class Iterates:
 
         See `Rub`. What friction alone holds runs away.
         """
-        self.last, self._sliding = None, _SLIDING
+        self.last, self._sliding, self._slid_by = None, _SLIDING, 0.0
         self._problem.couplings.contacts.rub(Rub.HARDLY)
 
     def try_again(self, *, pivots: bool) -> None:
@@ -60,9 +68,12 @@ class Iterates:
                 is the state that cycles, see `LentStiffness`.
         """
         self._rub_by_law()
-        self.last, self.imposed, self.runs_away = None, False, False
+        self.last, self.imposed = None, False
+        self.runs_away, self._slid_by = False, 0.0
         self._pivots = pivots and self._problem.integrator.inertia
         self._fewest, self._patience = np.inf, _PATIENCE
+        self.led = 0
+        self._joints.try_again()
 
     def at(self, x: PETSc.Vec) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one. Collective."""
@@ -79,6 +90,14 @@ class Iterates:
             new = self._pivoted(last, new, x)
         if self._sliding:
             new = self._slid(last, new, x)
+        elif self._slid_by:
+            # Friction that has let go of what it alone holds.
+            self._look_far(new, _FAR)
+            self._slid_by = 0.0
+        if last is not None and self._problem.couplings.rubbing:
+            new, led = self._joints.at(last, new, x)
+            self.led += led
+            self.imposed |= led
         self._settled = not self.imposed
         if last is None:
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
@@ -98,17 +117,14 @@ class Iterates:
         """
         contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
         parts = new.parts[: len(contacts.elements)]
-        far = [
-            (part.distance > c.candidates.length).any()
-            for c, part in zip(contacts.elements, parts, strict=True)
-        ]
         before = [] if last is None else last.parts[: len(parts)]
         changes = [(a.active != b.active).any() for a, b in zip(before, parts, strict=False)]
-        # Inertia holds what slides, and what is fast slides far.
-        self.runs_away = anywhere(comm, any(far)) and not self._problem.integrator.inertia
         left = self._sliding - 1
         self.imposed = True
+        self._look_far(new, 1.0)
         if (last is not None and not anywhere(comm, any(changes))) or left == 0:
+            slid = max((part.distance.max(initial=0.0) for part in parts), default=0.0)
+            self._slid_by = float(global_max(comm, np.array([slid]))[0])
             contacts.rub(Rub.SLIDES)
             with np.errstate(over="ignore", invalid="ignore"):
                 new = self._problem.evaluate(x)
@@ -116,6 +132,19 @@ class Iterates:
         else:
             self._sliding = left
         return new
+
+    def _look_far(self, e: Evaluation, share: float) -> None:
+        """Look whether nodes have slid farther than a share of a facet, so run away. Collective.
+
+        Inertia holds what slides, and what is fast slides far.
+        """
+        contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
+        least, both = _FARTHER * self._slid_by, zip(contacts.elements, e.parts, strict=False)
+        far = [
+            (part.distance > np.maximum(share * c.candidates.length, least)).any()
+            for c, part in both
+        ]
+        self.runs_away = anywhere(comm, any(far)) and not self._problem.integrator.inertia
 
     def _rub_by_law(self) -> None:
         if self._sliding:

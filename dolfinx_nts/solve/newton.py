@@ -247,7 +247,7 @@ class StepSolver:
         self.snes.setJacobian(self._at_iterate, *self._jacobian.operators)
         self.snes.setConvergenceTest(self._converged)
         self.snes.setLineSearchPreCheck(self._check_update)
-        self.snes.setTolerances(max_it=self.newton.max_iterations)
+        self.snes.setTolerances(max_it=2 * self.newton.max_iterations)
         self._solved = False
         self._jacobian.configure(self.snes)
 
@@ -298,8 +298,11 @@ class StepSolver:
             self._presets.learn(worst, self._before)
         self._wanders = iteration > 0 and (not unchanged or worst > self._before)
         self._before = worst
+        # Where friction of joints is blurred, iterates lead to a first guess, and have as many.
+        allowed = self.newton.max_iterations
+        allowed += min(self.iterates.led, allowed)
         if worst <= 1.0:
-            enough = self._passed is not None or iteration >= self.newton.max_iterations
+            enough = self._passed is not None or iteration >= allowed
             self._passed = last
             if enough or worst <= _SURE or not self._adds_up(last):
                 return reasons.CONVERGED_FNORM_RELATIVE
@@ -312,7 +315,7 @@ class StepSolver:
         in_vain |= not self._patient and iteration >= _CYCLING and self.iterates.cycles
         if in_vain or (late and self._is_inside_out(last)):
             return reasons.DIVERGED_FUNCTION_DOMAIN
-        if iteration >= self.newton.max_iterations:
+        if iteration >= allowed:
             return reasons.DIVERGED_MAX_IT
         self._presets.aim(self.snes, worst)
         return reasons.ITERATING

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from integrators import ACCELERATED, MID_STEP
-from scipy.optimize import brentq
+from scipy.optimize import brentq, lsq_linear
 
 import dolfinx_nts as nts
 
@@ -132,6 +132,52 @@ def test_a_pendulum_bounces_on_its_limit_until_friction_has_it():
     table = stepper.solution.balance
     assert (np.diff(table["contact_defect"]) >= -1e-12).all()
     assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["external_work"].max()
+
+
+@pytest.mark.parametrize("bound", [0.5, 5.0])
+def test_hinges_of_a_long_chain_begin_to_slip(bound):
+    """50 links that stand out horizontally: which hinges go is a problem of all of them at once.
+
+    Accelerations at rest make a^T M a/2 - weight^T a + bound sum|a| least; the torques are its
+    dual, a least squares problem with bounds.
+    """
+    links, length, mass, dt = 50, 0.1, 0.1, 1e-3
+    inertia, joints, bodies = mass * length**2 / 12, [], []
+    for k in range(links):
+        bodies.append(
+            nts.RigidBody.from_inertia(
+                mass, (0.1 * inertia, inertia, inertia), name=f"link {k}",
+                centre=(length * (k + 0.5), 0, 0),
+            )  # fmt: skip
+        )
+        joints.append(
+            nts.Revolute(
+                bodies[k], bodies[k - 1] if k else None, point=(length * k, 0, 0),
+                axis=(0, 1, 0), friction=nts.JointFriction(bound=bound), name=f"hinge {k}",
+            )  # fmt: skip
+        )
+    system = nts.System(bodies, joints=joints, gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=dt)
+    assert run.status == "completed"
+    arm = length * (np.arange(links) + 0.5 - np.arange(links)[:, None])
+    # Angles are from link to link, and a hinge moves what is beyond it.
+    beyond = arm * (arm > 0.0)
+    turned = np.triu(np.ones((links, links)))
+    matrix = mass * beyond @ beyond.T + inertia * turned @ turned.T
+    weight = mass * G * beyond.sum(axis=1)
+    root = np.linalg.cholesky(np.linalg.inv(matrix)).T
+    dual = lsq_linear(root, root @ weight, (-bound, bound), method="bvls", tol=1e-14).x
+    # Which hinges go is well conditioned, how far is so without those that stick.
+    slides, right = np.abs(dual) > (1.0 - 1e-9) * bound, np.zeros(links)
+    pulled = (weight - bound * np.sign(dual))[slides]
+    right[slides] = np.linalg.solve(matrix[np.ix_(slides, slides)], pulled)
+    assert slides.any() and (right * np.sign(dual) >= 0.0).all()
+    torques = [run.reactions[f"hinge {k} friction"][-1, 1, 1] for k in range(links)]
+    assert torques == pytest.approx(matrix @ right - weight, abs=1e-5 * bound)
+    angles = np.array([np.arctan2(-b.rotation[2, 0], b.rotation[0, 0]) for b in bodies])
+    slips = np.diff(angles, prepend=0.0)
+    assert slips == pytest.approx(0.5 * dt**2 * right, abs=1e-6 * dt**2 * np.abs(right).max())
+    assert_closed(run)
 
 
 @rules
