@@ -18,6 +18,8 @@ from dolfinx_nts.validation import StepFailedError
 
 #: Patches of a smooth surface part by less than this part of the way beyond their borders.
 _APART = 0.1
+#: Beyond an edge, in convective coordinates, where a facet is 2 wide: what may slide on it.
+_BY_EDGE = -8.0 * LETS_IN
 
 
 class SlavePaths:
@@ -197,8 +199,10 @@ class SlavePaths:
         x = slave[self._slave.share[node]]
         patch, control, xi, good = self._pair.projected(x, master, facet, np.zeros((len(x), 2)))
         carried, gaps = self._master.control_points(master_path, patch), []
+        edge = np.full(len(x), -np.inf)
         for place, points in ((x, control), (x + way, control + carried)):
             xi, _ = compiled.project(place, points, xi)
+            edge = np.maximum(edge, self._excess(xi))
             foot, _, normal = facets.frame(points, xi)
             gaps.append(np.einsum("ni,ni->n", normal, place - foot))
         above, below = gaps
@@ -207,11 +211,21 @@ class SlavePaths:
         part = np.ones(len(x))
         part[sinks] = np.clip(above[sinks] / (above - below)[sinks], 0.0, 1.0)
         at, found = x + part[:, None] * way, np.full(len(x), -1)
-        over = self._cones.across(node, facet, at, slave, (master, master_path), part)
+        slides, near = np.zeros(len(x), dtype=bool), edge > _BY_EDGE
+        if near.any():
+            over = self._cones.across(
+                node[near], facet[near], at[near], slave, (master, master_path), part[near]
+            )
+            slides[near] = over >= 0
         found[sinks] = self._convex.across(
             at[sinks], facet[sinks], master, master_path, part[sinks]
         )
-        return found, over >= 0
+        return found, slides
+
+    def _excess(self, xi: FloatArray) -> FloatArray:
+        """How far beyond the nearest edge coordinates (n, 2) lie, as of `edge_excess`, (n,)."""
+        excess: FloatArray = facets.edge_excess(xi, self._master.facets.shape[1]).max(axis=1)
+        return excess
 
     def _gap_at(
         self, facet: IntArray, xi: FloatArray, points: FloatArray, master: FloatArray
@@ -275,8 +289,9 @@ class SlavePaths:
         if self._pair.is_long(reach):
             hit = self.came_through(x, positions[1], *paths, held)
         if by_edges.size:
-            beyond = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
+            beyond, near = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
             hit[by_edges] = np.where(beyond >= 0, beyond, hit[by_edges])
+            by_edges = by_edges[near]
         node, facet = np.concatenate(
             [np.column_stack([by_edges, held[by_edges]]), self._sliding]
         ).T
@@ -298,8 +313,10 @@ class SlavePaths:
         master_path: FloatArray,
         held: IntArray,
         some: IntArray,
-    ) -> IntArray:
+    ) -> tuple[IntArray, BoolArray]:
         """Facet across the edge that some slaves are held beyond at the end, or -1, shape (n,).
+
+        And which of them are by an edge.
 
         Args:
             end: This rank's slaves there [m], shape (share, 3).
@@ -310,12 +327,12 @@ class SlavePaths:
         """
         moved, found, start = master + master_path, np.full(len(some), -1), np.zeros((len(some), 2))
         _, _, xi, converged = self._pair.projected(end[some], moved, held[some], start)
-        excess = facets.edge_excess(xi, self._master.facets.shape[1]).max(axis=1)
+        excess = self._excess(xi)
         out = np.flatnonzero(converged & (excess > ASIDE))
         node, whole = some[out], np.ones(len(out))
         other = self._convex.across(end[node], held[node], master, master_path, whole)
         found[out] = np.where(self._pair.facing.faces(node, other), other, -1)
-        return found
+        return found, excess > _BY_EDGE
 
     def strayed(
         self, positions: Sequence[FloatArray], found: Candidates, due: FloatArray
