@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import snap_fit
-from gmsh_parts import of_gmsh
+from gmsh_parts import deepest, of_gmsh
 from measures import kinds
 from scenes import everywhere
 
@@ -163,12 +163,10 @@ def test_a_seal_in_a_groove_of_tetrahedra_is_squeezed_as_between_planes(friction
 
 
 # ---- a chain
-@pytest.mark.slow
-@pytest.mark.parametrize("links", [3, 5])
-def test_links_of_a_chain_carry_one_force(links):
-    """Those between the ends are rigid and free to move along the chain; a weak spring starts them.
+def chain(links, interference="refuse"):
+    """Links, of which those between the ends are rigid and free to move along the chain.
 
-    What is pulled at one end comes out at the other one, but for the springs.
+    A weak spring starts them. Returns the bodies, the system, the springs' stiffness.
     """
     ring, wire, stiffness, stretch = 10.0, 3.0, 1.0, 0.3
     pitch = 2.0 * (ring - wire) - 0.02
@@ -199,9 +197,21 @@ def test_links_of_a_chain_carry_one_force(links):
             value=lambda t, far=far: (far * t, 0, 0),
         )
         bodies.append(part.continuum(steel, density=7.8e-9, bcs=[held], name=name))
+    faces = [body.surface(everywhere) for body in bodies[::-1]]
+    pairs = [
+        nts.ContactPair(*both, interference=interference)
+        for both in zip(faces[:-1], faces[1:], strict=True)
+    ]
+    return bodies, nts.System(bodies, contacts=pairs, joints=joints), stiffness
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("links", [3, 5])
+def test_links_of_a_chain_carry_one_force(links):
+    """What is pulled at one end comes out at the other one, but for the springs."""
+    bodies, system, stiffness = chain(links)
     starts = [body.position[0] for body in bodies[1:-1]]
-    pairs = press(bodies[::-1], 0.0, False)
-    run = nts.equilibrium(nts.System(bodies, contacts=pairs, joints=joints), load_steps=4)
+    run = nts.equilibrium(system, load_steps=4)
     assert run.status == "completed"
     assert np.mean(run.balance["newton_iterations"][1:]) <= 8.0
     pulled = run.reactions[f"link {links - 1}"][-1].sum(axis=0)[0]
@@ -210,6 +220,25 @@ def test_links_of_a_chain_carry_one_force(links):
     ways = [body.position[0] - x for body, x in zip(bodies[1:-1], starts, strict=True)]
     left = stiffness * np.cumsum([0.0, *ways[::-1]])
     assert -run.contact_forces[-1, :, 0] == pytest.approx(pulled - left, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(COMM.size > 1, reason="looks at tetrahedra of one rank")
+@pytest.mark.parametrize("interference", ["refuse", "resolve"])
+def test_chords_that_start_inside_each_other_are_told_or_pressed_out(interference):
+    """Links leave 0.02 of 14, and chords of the wire's inner side reach 0.2 into the hole."""
+    bodies, system, _ = chain(3, interference)
+    start = [(b.position.copy(), b.rotation.copy()) if b.rigid else None for b in bodies]
+    run = nts.equilibrium(system, load_steps=4)
+    assert run.status == "completed"
+    assert ("edges start inside" in kinds(run)) == (interference == "refuse")
+    places = list(zip(bodies, start, strict=True))
+    depth = [
+        deepest(one, two, at, there, between=9)
+        for k in (0, 1)
+        for (one, at), (two, there) in (places[k : k + 2], places[k : k + 2][::-1])
+    ]
+    assert max(depth) > 0.05 if interference == "refuse" else max(depth) < 0.01
 
 
 # ---- a snap fit
