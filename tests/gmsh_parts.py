@@ -44,9 +44,24 @@ def tetrahedra(body, start):
     return space.tabulate_dof_coordinates() + body.u.x.array.reshape(-1, 3), cells
 
 
-def deepest(body, other, start=None, other_start=None):
-    """Depth of the deepest node of a body in another one, over the other's mean edge."""
-    (points, _), (x, cells) = tetrahedra(body, start), tetrahedra(other, other_start)
+def skin(cells):
+    """Faces of tetrahedra that only one of them has."""
+    faces, number = np.unique(
+        np.sort(np.concatenate([cells[:, f] for f in FACES]), axis=1), axis=0, return_counts=True
+    )
+    return faces[number == 1]
+
+
+def deepest(body, other, start=None, other_start=None, between=0):
+    """Depth of the deepest node of a body in another one, over the other's mean edge.
+
+    Or of its nodes and of points between them, as many on each edge of its skin.
+    """
+    (points, own), (x, cells) = tetrahedra(body, start), tetrahedra(other, other_start)
+    if between:
+        ends = points[skin(own)]
+        ways = np.linspace(0.0, 1.0, between + 2)[:-1, None, None, None]
+        points = (ends + ways * (np.roll(ends, 1, axis=1) - ends)).reshape(-1, 3)
     corners = x[cells]
     edges = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2)
     tree = cKDTree(corners.mean(axis=1))
@@ -61,8 +76,5 @@ def deepest(body, other, start=None, other_start=None):
     inside = np.unique(node[(weights > 1e-9).all(axis=1)])
     if not inside.size:
         return 0.0
-    faces, number = np.unique(
-        np.sort(np.concatenate([cells[:, f] for f in FACES]), axis=1), axis=0, return_counts=True
-    )
-    skin = x[faces[number == 1]]
-    return max(distances(points[[i]], skin).min() for i in inside) / edges.mean()
+    faces = x[skin(cells)]
+    return max(distances(points[[i]], faces).min() for i in inside) / edges.mean()

@@ -168,7 +168,10 @@ class ContactSearch:
 
     def _positions(self, k: int) -> Sequence[FloatArray]:
         """Positions of all points of a contact at t_n [m], see `ContactPair`. Collective."""
-        if k not in self._placed:
+        if k not in self._placed and k >= self._declared:
+            # What corners touch lies where their pair's surfaces do.
+            self._placed[k] = self._positions(self._corners[k - self._declared][1])[::-1]
+        elif k not in self._placed:
             u = [self._step.state.u[b] for b in self._of[k]]
             self._placed[k] = self._pairs[k].positions(u)
         return self._placed[k]

@@ -42,6 +42,9 @@ class Corners(FacetPair):
             _with_corners(of), of.slave, friction=of.friction, interference=of.interference,
             adjust=of.adjust,
         )  # fmt: skip
+        # Points are where they are for the pair.
+        self.origin, self.extent = of.origin, of.extent
+        self._asked: IntArray = np.empty(0, dtype=np.int64)
 
     @property
     def sharp_edges(self) -> tuple[Edges, Edges]:  # type: ignore[override]
@@ -94,6 +97,7 @@ class Corners(FacetPair):
         found = super()._closest(slaves, corners, reach, current)
         node = np.flatnonzero(found.facet >= 0)
         found.facet[node[self._held(node, found.facet[node], slaves, corners)]] = -1
+        self._asked = found.facet
         return found
 
     def find(
@@ -110,7 +114,11 @@ class Corners(FacetPair):
         if not len(c.node):
             return found
         # Their ways may have led them to other facets.
-        held = self._held(c.node, c.facet, positions[0], positions[1][self.master.facets])
+        held, led = np.zeros(len(c.node), dtype=bool), c.facet != self._asked[c.node]
+        if not led.any():
+            return found
+        corners = positions[1][self.master.facets]
+        held[led] = self._held(c.node[led], c.facet[led], positions[0], corners)
         # What they enter meanwhile does not throw them out.
         found.followed[c.node[held & (c.gap < -OUTSIDE * c.length)]] = False
         return found._replace(candidates=c.select(~held))

@@ -144,6 +144,12 @@ class EdgeContact:
         """Of the smallest facet [m]."""
         return min(surface.smallest for surface in self.pair.surfaces)
 
+    @cached_property
+    def lengths(self) -> list[FloatArray]:
+        """Of the edges in the reference [m], shape (n,) each."""
+        ends = (edges.surface.reference[edges.ends] for edges in self.edges)
+        return [np.linalg.norm(x[:, 1] - x[:, 0], axis=1) for x in ends]
+
     def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Positions of all points of both boundaries in the pair's frame [m]. Collective.
 

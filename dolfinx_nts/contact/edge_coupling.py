@@ -31,6 +31,9 @@ _TOUCH = 4.0
 _NEAR = 1e-6
 #: Part of the step's motion by which edges that contact passes on to may have passed each other.
 _OVERSHOT = 0.1
+#: Parts of the shorter edge up to which edges that start inside each other are looked at, and
+#: from which on they are told.
+_STARTS, _TOLD = 0.2, 0.01
 #: `Near.node` of a node that has the contact if it is a candidate, from here on.
 _ASKED = 3
 #: Of a cube of unit edges.
@@ -66,6 +69,8 @@ class EdgeCoupling:
         self._way, self._clear = 0.0, 0.0
         # Where the boundaries' points were at the end of the last solution.
         self._end: tuple[Sequence[FloatArray], Sequence[FloatArray]] | None = None
+        # How deep edges start inside each other that nothing presses out, in lengths, and when.
+        self._inside, self._start = 0.0, np.nan
         # Where they were last, and whether their motion from there is known.
         self._last: Sequence[FloatArray] = ()
         self._followed = False
@@ -116,6 +121,7 @@ class EdgeCoupling:
     ) -> None:
         """Note a step, as of `Coupling.begin`; the search for nodes says whether `find` is due."""
         self._step, self._history = step, history
+        self._start = step.state.time if np.isnan(self._start) else self._start
         if again is None:
             self._carried, self._tried = history, _NONE[:, 0]
 
@@ -144,7 +150,7 @@ class EdgeCoupling:
         ways = [edges.surface.gather(step.ahead[b]) for edges, b in both]
         found = self._pairs.closest(self._x, ways, reach + near, near, limit)
         old = gather_rows(self._comm, self._history.pair)
-        some = len(old) or len(self._tried) or found.some[0]
+        some = len(old) or len(self._tried) or found.some[0] or step.state.time == self._start
         if not some and self.contact.pair.holds_nodes:
             return _NONE[:, 0]
         pairs, chosen = self._pairs.numbers, self._choose(found, old, reach, limit)
@@ -172,6 +178,8 @@ class EdgeCoupling:
         near, meet = gap > -_OVERSHOT * reach, found.meet[:, :2].any(axis=1)
         follows &= near & (gap < (limit if holds else reach))
         chosen = found.touch | ((carries | follows) & meet)
+        if self._step.state.time == self._start and not len(old):
+            chosen |= self._pressed_out(found)
         if not holds:
             # A rim enters a little what is kept out of it in the mean.
             chosen |= near & (gap < limit) & meet & (found.node == 0)
@@ -187,6 +195,21 @@ class EdgeCoupling:
         self._take_once(found, chosen, carries)
         self._tried = self._key(pairs[chosen])
         return chosen
+
+    def _pressed_out(self, found: Near) -> BoolArray:
+        """Which of the pairs that start inside each other are pressed out.
+
+        Those of load steps, if the contact resolves what starts inside, as chords of curves may do.
+        Else they are let through until they are out, and told.
+        """
+        assert self._pairs is not None
+        contact, rule = self.contact, self._step.integrator
+        both = zip(contact.lengths, self._pairs.numbers.T, strict=True)
+        depth = -found.gap[:, 0] / np.minimum(*(length[k] for length, k in both))
+        inside = found.meet[:, 0] & (found.node == 0) & (depth > 0.0) & (depth < _STARTS)
+        asked = contact.pair.interference == "resolve" and not rule.inertia
+        self._inside = 0.0 if asked else float(depth[inside].max(initial=0.0))
+        return inside & asked
 
     @cached_property
     def _near(self) -> float:
@@ -376,8 +399,18 @@ class EdgeCoupling:
         return {"min_gap": min((float(p.gap.min(initial=np.inf)) for p in parts), default=np.inf)}
 
     def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
-        """Nothing to warn of."""
-        return []
+        """Edges that start inside each other and are let through."""
+        inside, self._inside = self._inside, 0.0
+        if inside <= _TOLD:
+            return []
+        name = self.contact.pair.name
+        text = (
+            f"edges of contact {name!r} start inside each other by up to {inside:.3g} of their "
+            "length, as chords of curves do, and are let through until they are out: move the "
+            "bodies apart, or pass interference='resolve' to the pair and let load steps of "
+            "equilibrium press them out"
+        )
+        return [StepWarning("edges start inside", inside, text, (name,))]
 
     def history(self, parts: Sequence[Any]) -> EdgeHistory:
         """The pairs that carry, or are followed, and their forces."""

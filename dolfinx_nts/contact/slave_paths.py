@@ -9,14 +9,17 @@ import numpy as np
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE
+from dolfinx_nts.contact.normal_cones import LETS_IN, NormalCones
 from dolfinx_nts.contact.pair import MARGIN, Candidates, Motion
 from dolfinx_nts.kernels import compiled, facets, nts_element
 from dolfinx_nts.parallel import anywhere, raise_together
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError
 
 #: Patches of a smooth surface part by less than this part of the way beyond their borders.
 _APART = 0.1
+#: Beyond an edge, in convective coordinates, where a facet is 2 wide: what may slide on it.
+_BY_EDGE = -8.0 * LETS_IN
 
 
 class SlavePaths:
@@ -29,6 +32,9 @@ class SlavePaths:
     def __init__(self, pair: Any) -> None:
         self._pair, self._slave, self._master = pair, pair.slave, pair.master
         self._convex = pair.convex
+        self._cones = NormalCones(pair)
+        # Slaves that slide over edges in the step, and the facets before these.
+        self._sliding: IntArray = np.empty((0, 2), dtype=np.int64)
 
     def lead(
         self,
@@ -48,7 +54,7 @@ class SlavePaths:
         x = slave[self._slave.share]
         slave_path, master_path = self.gather(motion.paths)
         found = self._round_edges(found, x, master, slave_path, master_path)
-        found = self._past_edges(found, x, master, slave_path, master_path, motion.reach)
+        found = self._past_edges(found, slave, master, slave_path, master_path, motion.reach)
         change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
         corners, node = master[self._master.facets], found.node[change]
         if len(node):
@@ -131,7 +137,7 @@ class SlavePaths:
     def _past_edges(
         self,
         found: Candidates,
-        x: FloatArray,
+        slave: FloatArray,
         master: FloatArray,
         slave_path: FloatArray,
         master_path: FloatArray,
@@ -139,8 +145,10 @@ class SlavePaths:
     ) -> Candidates:
         """Candidates that will cross a facet's plane beyond its edge, with the facet beyond that.
 
-        Arguments as of `_round_edges` and `Motion`.
+        Without those that slide over an edge, which no facet holds unless they come deeper than it.
+        Arguments as of `lead`, `_round_edges` and `Motion`.
         """
+        x, self._sliding = slave[self._slave.share], self._sliding[:0]
         # A facet is 2 xi wide, and less along its heights; most nodes come to no edge of theirs.
         nc = self._master.facets.shape[1]
         beyond = facets.edge_excess(found.xi, nc).max(axis=1, initial=-1.0)
@@ -149,49 +157,75 @@ class SlavePaths:
             return found
         some = found.select(near)
         end, moved = (x + slave_path)[some.node], master + master_path
-        some = some.select(self._gap_at(some.facet, some.xi, end, moved) < 0.0)
+        gap = self._gap_at(some.facet, some.xi, end, moved)
+        some = some.select(gap < LETS_IN * some.length)
         if not some.node.size:
             return found
         node = some.node
-        facet = self._passed(x[node], slave_path[node], some.facet, master, master_path)
-        change = (facet >= 0) & self._pair.facing.faces(node, facet)
+        facet, slides = self._passed(
+            node, slave, slave_path[node], some.facet, master, master_path
+        )
+        self._sliding = np.column_stack([node, some.facet])[slides]
+        found = found.select(~np.isin(found.node, node[slides]))
+        change = (facet >= 0) & ~slides & self._pair.facing.faces(node, facet)
         if not change.any():
             return found
         return self._moved_to(found, node[change], facet[change], x, master)
 
     def _passed(
         self,
-        x: FloatArray,
+        node: IntArray,
+        slave: FloatArray,
         way: FloatArray,
         facet: IntArray,
         master: FloatArray,
         master_path: FloatArray,
-    ) -> IntArray:
+    ) -> tuple[IntArray, BoolArray]:
         """Facets that nodes pass when they cross the planes of others, or -1, shape (n,).
+
+        And which of the nodes slide over an edge of theirs.
 
         The plane of a facet goes on beyond its edges, the body does not: what crosses it beyond a
         sharp convex edge passes the facet on the other side of that edge.
 
         Args:
-            x: Nodes at t_n [m], shape (n, 3).
-            way: Their motion [m], shape (n, 3).
+            node: Slaves, shape (n,).
+            slave: Points of the slave at t_n [m].
+            way: Motion of the nodes [m], shape (n, 3).
             facet: Facets, shape (n,).
             master: Points of the master at t_n [m].
             master_path: Their motion [m].
         """
+        x = slave[self._slave.share[node]]
         patch, control, xi, good = self._pair.projected(x, master, facet, np.zeros((len(x), 2)))
         carried, gaps = self._master.control_points(master_path, patch), []
+        edge = np.full(len(x), -np.inf)
         for place, points in ((x, control), (x + way, control + carried)):
             xi, _ = compiled.project(place, points, xi)
+            edge = np.maximum(edge, self._excess(xi))
             foot, _, normal = facets.frame(points, xi)
             gaps.append(np.einsum("ni,ni->n", normal, place - foot))
         above, below = gaps
         length = facets.size(master[self._master.facets[facet]])
-        sinks = np.flatnonzero(good & (below < -OUTSIDE * length) & (below < above))
-        part = np.clip(above[sinks] / (above - below)[sinks], 0.0, 1.0)
-        at, found = x[sinks] + part[:, None] * way[sinks], np.full(len(x), -1)
-        found[sinks] = self._convex.across(at, facet[sinks], master, master_path, part)
-        return found
+        sinks = good & (below < -OUTSIDE * length) & (below < above)
+        part = np.ones(len(x))
+        part[sinks] = np.clip(above[sinks] / (above - below)[sinks], 0.0, 1.0)
+        at, found = x + part[:, None] * way, np.full(len(x), -1)
+        slides, near = np.zeros(len(x), dtype=bool), edge > _BY_EDGE
+        if near.any():
+            over = self._cones.across(
+                node[near], facet[near], at[near], slave, (master, master_path), part[near]
+            )
+            slides[near] = over >= 0
+        found[sinks] = self._convex.across(
+            at[sinks], facet[sinks], master, master_path, part[sinks]
+        )
+        return found, slides
+
+    def _excess(self, xi: FloatArray) -> FloatArray:
+        """How far beyond the nearest edge coordinates (n, 2) lie, as of `edge_excess`, (n,)."""
+        excess: FloatArray = facets.edge_excess(xi, self._master.facets.shape[1]).max(axis=1)
+        return excess
 
     def _gap_at(
         self, facet: IntArray, xi: FloatArray, points: FloatArray, master: FloatArray
@@ -241,18 +275,35 @@ class SlavePaths:
         comm = self._slave.body.comm
         by_edges = np.flatnonzero((held >= 0) & self._convex.sharp[held])
         let_go = np.flatnonzero((held < 0) & (aimed >= 0) & self._convex.sharp[aimed])
-        aside = self._convex.sharp.any() and anywhere(comm, bool(by_edges.size or let_go.size))
+        some = by_edges.size or let_go.size or len(self._sliding)
+        aside = self._convex.sharp.any() and anywhere(comm, bool(some))
         if not (aside or self._pair.is_long(reach)):
             return None
-        x, paths = positions[0][self._slave.share], self.gather(motions)
+        share = self._slave.share
+        both = zip(self._pair.surfaces, motions, strict=True)
+        slave_path, master_path = (surface.gather(path) for surface, path in both)
+        x, paths = positions[0][share], (slave_path[share], master_path)
         if aside:
             self._refuse_cut_corners(x, positions[1], *paths, let_go)
         hit = np.full(len(held), -1)
         if self._pair.is_long(reach):
             hit = self.came_through(x, positions[1], *paths, held)
         if by_edges.size:
-            beyond = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
+            beyond, near = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
             hit[by_edges] = np.where(beyond >= 0, beyond, hit[by_edges])
+            by_edges = by_edges[near]
+        node, facet = np.concatenate(
+            [np.column_stack([by_edges, held[by_edges]]), self._sliding]
+        ).T
+        if node.size:
+            end, whole = positions[0] + slave_path, np.ones(len(node))
+            master = positions[1], master_path
+            over = self._cones.across(node, facet, end[share[node]], end, master, whole)
+            new = (over >= 0) & (over != aimed[node])
+            new &= (held[node] >= 0) | self._cones.behind(
+                facet, end[share[node]], positions[1] + master_path
+            )
+            hit[node[new]] = over[new]
         return hit
 
     def _held_beyond(
@@ -262,8 +313,10 @@ class SlavePaths:
         master_path: FloatArray,
         held: IntArray,
         some: IntArray,
-    ) -> IntArray:
+    ) -> tuple[IntArray, BoolArray]:
         """Facet across the edge that some slaves are held beyond at the end, or -1, shape (n,).
+
+        And which of them are by an edge.
 
         Args:
             end: This rank's slaves there [m], shape (share, 3).
@@ -274,12 +327,12 @@ class SlavePaths:
         """
         moved, found, start = master + master_path, np.full(len(some), -1), np.zeros((len(some), 2))
         _, _, xi, converged = self._pair.projected(end[some], moved, held[some], start)
-        excess = facets.edge_excess(xi, self._master.facets.shape[1]).max(axis=1)
+        excess = self._excess(xi)
         out = np.flatnonzero(converged & (excess > ASIDE))
         node, whole = some[out], np.ones(len(out))
         other = self._convex.across(end[node], held[node], master, master_path, whole)
         found[out] = np.where(self._pair.facing.faces(node, other), other, -1)
-        return found
+        return found, excess > _BY_EDGE
 
     def strayed(
         self, positions: Sequence[FloatArray], found: Candidates, due: FloatArray

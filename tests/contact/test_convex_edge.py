@@ -8,6 +8,7 @@ from integrators import MID_STEP
 from scenes import box, everywhere
 
 import dolfinx_nts as nts
+from dolfinx_nts.dolfinx_compat import create_mesh
 
 COMM = MPI.COMM_WORLD
 
@@ -87,3 +88,55 @@ def test_what_hits_the_top_is_held_and_what_passes_beside_it_is_not(slope, passe
         _, force = passing(slope, corner, velocity, nts.EnergyMomentum(), 0.02, output=[far])
         assert (force > 1e-6) == hit
         assert far.beyond < 1e-4
+
+
+def hexahedra(x, cells):
+    """A rigid body's mesh, built on rank 0."""
+    x, cells = np.array(x), np.array(cells)
+    if COMM.rank > 0:
+        x, cells = x[:0], cells[:0]
+    return create_mesh(COMM, cells, x, "hexahedron")
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("metre", [1.0, 2.0**-10])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("raised", [0.0, 1e-5, 3e-3])
+def test_a_sharp_edge_that_slides_up_a_roof_passes_the_nodes_of_its_ridge(raised, friction, metre):
+    """The ridge comes to the edge at its height, or deeper by what its middle node is raised.
+
+    No face before the edge catches it: the roof is a wedge on a spring, push = force tan(slope +
+    angle of friction), and friction's force once the edge is on the flat top.
+    """
+    low, slope, stiffness = 0.05, 0.5, 1.0
+    profile = [(-3.0, low), (-1.0, 1.0), (1.0, 1.0), (1.0 + (1.0 - low) / slope, low)]
+    columns = [(x, y, z) for x, z in profile for y in (-1.0, 0.0, 1.0)]
+    x = metre * np.array([(x, y, -0.5) for x, y, _ in columns] + columns)
+    x[12 + 7, 2] += metre * raised
+    corners = [3 * i + j for i in range(3) for j in range(2)]
+    cells = [[k + c + d for d in (0, 12) for c in (0, 1, 3, 4)] for k in corners]
+    roof = nts.RigidBody(hexahedra(x, cells), density=1.0, name="roof")
+    at = 2.0
+    outline = [(at, 0.0), (at + 0.4, 0.0), (at - 0.5, 3.0), (at + 2.0, 3.0)]
+    x = [(x, y, z + 1.0 - slope * (at - 1.0) + raised) for y in (-0.8, 0.8) for x, z in outline]
+    catch = nts.RigidBody(
+        hexahedra(metre * np.array(x), [[4, 5, 0, 1, 6, 7, 2, 3]]), density=1.0, name="catch",
+        motion=lambda t: (-metre * t, 0, 0), rotation=(0, 0, 0),
+    )  # fmt: skip
+    guide = nts.Prismatic(roof, None, point=(0, 0, 0), axis=(0, 0, 1))
+    spring = nts.Spring(
+        roof, None, points=((0, 0, 0), (0, 0, 1e3 * metre)), stiffness=stiffness,
+        length=1e3 * metre,
+    )  # fmt: skip
+    above = roof.surface(lambda x: x[2] > metre * (low - 1e-6))
+    pair = nts.ContactPair(above, catch.surface(everywhere), friction=friction)
+    system = nts.System([roof, catch], contacts=[pair], joints=[guide, spring])
+    run = nts.equilibrium(system, load_steps=np.linspace(0.0, 1.5, 16)[1:])
+    assert run.status == "completed"
+    way = run.balance["time"][1:]
+    press = stiffness * metre * slope * np.minimum(way, 1.0)
+    right = np.where(way < 0.99, np.tan(np.arctan(slope) + np.arctan(friction)), friction)
+    push, settled = np.abs(run.contact_forces[1:, 0, 0]), np.abs(way - 1.0) > 0.05
+    # Where the middle node is raised, the edge starts over the slope and the top is not flat.
+    room = metre * stiffness * (1e-9 + 2.0 * raised)
+    np.testing.assert_allclose(push[settled], (press * right)[settled], atol=room)

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import snap_fit
-from gmsh_parts import of_gmsh
+from gmsh_parts import deepest, of_gmsh
 from measures import kinds
 from scenes import everywhere
 
@@ -176,12 +176,10 @@ def test_a_seal_that_friction_alone_keeps_from_rolling(friction):
 
 
 # ---- a chain
-@pytest.mark.slow
-@pytest.mark.parametrize("links", [3, 5])
-def test_links_of_a_chain_carry_one_force(links):
-    """Those between the ends are rigid and free to move along the chain; a weak spring starts them.
+def chain(links, interference="refuse"):
+    """Links, of which those between the ends are rigid and free to move along the chain.
 
-    What is pulled at one end comes out at the other one, but for the springs.
+    A weak spring starts them. Returns the bodies, the system, the springs' stiffness.
     """
     ring, wire, stiffness, stretch = 10.0, 3.0, 1.0, 0.3
     pitch = 2.0 * (ring - wire) - 0.02
@@ -212,9 +210,21 @@ def test_links_of_a_chain_carry_one_force(links):
             value=lambda t, far=far: (far * t, 0, 0),
         )
         bodies.append(part.continuum(steel, density=7.8e-9, bcs=[held], name=name))
+    faces = [body.surface(everywhere) for body in bodies[::-1]]
+    pairs = [
+        nts.ContactPair(*both, interference=interference)
+        for both in zip(faces[:-1], faces[1:], strict=True)
+    ]
+    return bodies, nts.System(bodies, contacts=pairs, joints=joints), stiffness
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("links", [3, 5])
+def test_links_of_a_chain_carry_one_force(links):
+    """What is pulled at one end comes out at the other one, but for the springs."""
+    bodies, system, stiffness = chain(links)
     starts = [body.position[0] for body in bodies[1:-1]]
-    pairs = press(bodies[::-1], 0.0, False)
-    run = nts.equilibrium(nts.System(bodies, contacts=pairs, joints=joints), load_steps=4)
+    run = nts.equilibrium(system, load_steps=4)
     assert run.status == "completed"
     pulled = run.reactions[f"link {links - 1}"][-1].sum(axis=0)[0]
     assert pulled > 1e4
@@ -222,6 +232,25 @@ def test_links_of_a_chain_carry_one_force(links):
     ways = [body.position[0] - x for body, x in zip(bodies[1:-1], starts, strict=True)]
     left = stiffness * np.cumsum([0.0, *ways[::-1]])
     assert -run.contact_forces[-1, :, 0] == pytest.approx(pulled - left, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(COMM.size > 1, reason="looks at tetrahedra of one rank")
+@pytest.mark.parametrize("interference", ["refuse", "resolve"])
+def test_chords_that_start_inside_each_other_are_told_or_pressed_out(interference):
+    """Links leave 0.02 of 14, and chords of the wire's inner side reach 0.2 into the hole."""
+    bodies, system, _ = chain(3, interference)
+    start = [(b.position.copy(), b.rotation.copy()) if b.rigid else None for b in bodies]
+    run = nts.equilibrium(system, load_steps=4)
+    assert run.status == "completed"
+    assert ("edges start inside" in kinds(run)) == (interference == "refuse")
+    places = list(zip(bodies, start, strict=True))
+    depth = [
+        deepest(one, two, at, there, between=9)
+        for k in (0, 1)
+        for (one, at), (two, there) in (places[k : k + 2], places[k : k + 2][::-1])
+    ]
+    assert max(depth) > 0.05 if interference == "refuse" else max(depth) < 0.01
 
 
 # ---- a snap fit
@@ -261,9 +290,13 @@ def insertion():
 
 @pytest.mark.slow
 @pytest.mark.skipif(COMM.size > 1, reason="makes its meshes of one rank's arrays")
+@pytest.mark.parametrize("exchanged", [False, True])
 @pytest.mark.parametrize("kind", ["rigid", "soft"])
-def test_a_snap_fit_of_two_solids_takes_the_force_that_beams_say(kind):
-    """A catch with a sharp edge rides up the nose, over its edge and along its flat face."""
+def test_a_snap_fit_of_two_solids_takes_the_force_that_beams_say(kind, exchanged):
+    """A catch with a sharp edge rides up the nose, over its edge and along its flat face.
+
+    Between nodes of the nose its edge sinks in a little, and must not be caught by them.
+    """
     nose = nts.Continuum(
         hook(48), nts.NeoHookean(young=YOUNG, poisson=0.0), density=1.4e3, name="hook",
         bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
@@ -282,12 +315,13 @@ def test_a_snap_fit_of_two_solids_takes_the_force_that_beams_say(kind):
         stiff = nts.NeoHookean(young=100.0 * YOUNG, poisson=0.0)
         catch = nts.Continuum(mesh, stiff, density=1.4e3, name="catch", bcs=[held])
     face = nose.surface(lambda x: x[2] > 0.5 * THICK - 1e-9)
-    pair = nts.ContactPair(catch.surface(everywhere), face, friction=RUBS)
+    both = (catch.surface(everywhere), face)[:: -1 if exchanged else 1]
+    pair = nts.ContactPair(*both, friction=RUBS)
     climb = 1e3 * UNDERCUT * slope / (NOSE - BLUNT)
     steps = [*np.linspace(0, climb - 0.2, 9)[1:], *np.linspace(climb - 0.2, climb + 0.05, 26)[1:]]
     run = nts.equilibrium(nts.System([nose, catch], contacts=[pair]), load_steps=steps)
     assert run.status == "completed"
-    push, right = run.contact_forces[:, 0, 0], insertion()
+    push, right = np.abs(run.contact_forces[:, 0, 0]), insertion()
     assert push.max() == pytest.approx(right[0], rel=0.03)
     # Farther on the spring is shorter.
     assert push[push.argmax() + 1] == pytest.approx(right[1], rel=0.03)
