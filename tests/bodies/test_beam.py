@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from lines import arc, interval_mesh, straight
-from scenes import UNITS
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -237,12 +236,6 @@ def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
     assert off(coarse)[0] > 0.05 and "does not keep it" in coarse.status
 
 
-def test_millimetres_take_the_same_iterations():
-    (metres, x), (millimetres, y) = (fly(EM, 0.1, 1, s) for s in (1, UNITS[0]))
-    assert np.abs(y / UNITS[0] - x).max() < 1e-11 * np.abs(x).max()
-    assert (millimetres.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
-
-
 @pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("loaded", ["directors", "rigid tip"])
@@ -464,5 +457,3 @@ def test_a_section_must_be_positive(wrong):
     good = {"EA": 1, "GA": (1, 1), "GJ": 1, "EI": (1, 1), "rhoA": 1, "rhoI": (1, 1)}
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*positive"):
         nts.Section(**good | wrong)
-
-

@@ -92,17 +92,10 @@ def test_bodies_that_touch_across_a_gap_keep_momenta_and_energy(integrator):
     assert not far.balance["active"].any()
 
 
-def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
-    whole = nts.simulate(rubbing(0.0501), nts.EnergyMomentum(), dt=2e-3, t_end=0.04)
+def test_a_checkpoint_of_another_gap_is_refused(mpi_tmp_path):
     path = mpi_tmp_path / "run.h5"
-    saves = nts.Checkpoint(path, every=10)
-    nts.simulate(rubbing(0.0501), nts.EnergyMomentum(), dt=2e-3, t_end=0.02, checkpoint=saves)
-    system = rubbing(0.0501)
-    start = nts.restart(path, system)
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.04, start=start)
-    for name in ("energy", "friction_dissipation", "contact_defect"):
-        found, wanted = (r.balance[name][-1] for r in (run, whole))
-        assert found == pytest.approx(wanted, rel=1e-9), name
+    saves = nts.Checkpoint(path, every=1)
+    nts.simulate(rubbing(0.0501), nts.EnergyMomentum(), dt=2e-3, t_end=2e-3, checkpoint=saves)
     with pytest.raises(ValueError, match="adjust"):
         nts.restart(path, rubbing(0.0502))
 

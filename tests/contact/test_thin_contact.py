@@ -355,21 +355,6 @@ def sliding(comm=MPI.COMM_WORLD):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_a_run_goes_on_from_a_checkpoint_in_contact(mpi_tmp_path):
-    """Of a beam that slides on a plate, as if nothing had stopped it."""
-    path = mpi_tmp_path / "thin.h5"
-
-    whole, first, second = sliding(), sliding(), sliding()
-    run = nts.simulate(whole, EM, dt=1e-3, t_end=4e-3)
-    nts.simulate(first, EM, dt=1e-3, t_end=2e-3, checkpoint=nts.Checkpoint(path, every=2))
-    nts.simulate(second, EM, dt=1e-3, t_end=4e-3, start=nts.restart(path, second))
-    assert run.balance["active"][1:].max() > 0
-    for a, b in zip(whole.bodies, second.bodies, strict=True):
-        assert a.comm.allreduce(np.abs(a.u.x.array - b.u.x.array).max(initial=0.0)) < 1e-11
-
-
-@pytest.mark.mpi
 @pytest.mark.skipif(MPI.COMM_WORLD.size == 1, reason="compares ranks with a serial run")
 def test_a_checkpoint_goes_on_on_other_ranks(mpi_tmp_path):
     """From each rank alone to all of them, of a beam that slides on a plate."""

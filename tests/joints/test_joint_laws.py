@@ -250,22 +250,6 @@ def test_actuators_make_an_oscillator(rule):
         assert_closed(run)
 
 
-def test_a_run_goes_on_with_laws_from_a_checkpoint(tmp_path):
-    laws = {"friction": nts.JointFriction(bound=1.0), "limits": (-1.0, 0.4)}
-    path = COMM.bcast(tmp_path) / "run.h5"
-    body, system = pendulum(**laws)
-    whole = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.6)
-    end = angle(body)
-    _, system = pendulum(**laws)
-    written = nts.Checkpoint(path, every=20)
-    nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.2, checkpoint=written)
-    body, system = pendulum(**laws)
-    start = nts.restart(path, system)
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.6, start=start)
-    assert angle(body) == pytest.approx(end, abs=1e-10)
-    assert np.allclose(run.balance["energy"], whole.balance["energy"], atol=1e-10)
-
-
 @pytest.mark.parametrize("rule", ACCELERATED.values(), ids=ACCELERATED)
 def test_laws_that_let_go_ask_for_another_integrator(rule):
     _, system = disc(1.0, friction=nts.JointFriction(bound=0.1))
