@@ -8,6 +8,7 @@ import pytest
 import two_blocks
 from integrators import CONTACT_RULES
 from measures import drift
+from pairs import pairs
 from scenes import CELLS, RUBBER, UNITS, at, box, rubbing_blocks, symmetry
 
 import dolfinx_nts as nts
@@ -156,9 +157,7 @@ def assert_kept(run, rule):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", [0.0, 0.4])
-@pytest.mark.parametrize("rule", CONTACT_RULES)
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(("rule", "friction", "cell"), pairs(CONTACT_RULES, [0.0, 0.4], CELLS))
 def test_energy_and_momenta(rule, friction, cell):
     run = impact(rule, friction, cell=CELLS[cell])
     assert_kept(run, rule)

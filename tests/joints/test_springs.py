@@ -9,6 +9,7 @@ import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS
 from measures import kinds
+from pairs import pairs
 from scenes import UNITS
 from scipy.integrate import quad, solve_ivp
 
@@ -68,9 +69,9 @@ ITEMS = {
 }
 
 
-@pytest.mark.parametrize("rule", [*INTEGRATORS, "static"])
-@pytest.mark.parametrize("item", ITEMS)
-@pytest.mark.parametrize("ground", [None, 0, 1])
+@pytest.mark.parametrize(
+    ("item", "rule", "ground"), pairs(ITEMS, [*INTEGRATORS, "static"], [None, 0, 1])
+)
 def test_tangents_are_derivatives(item, rule, ground):
     a, b = tumbling()
     ends = [None if k == ground else body for k, body in enumerate((a, b))]
