@@ -99,6 +99,7 @@ def test_the_cantilever_of_reissners_equations(n):
 @pytest.mark.mpi
 @pytest.mark.parametrize("flipped", [False, True], ids=["in order", "shuffled"])
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("shuffled")
 def test_the_bend_of_bathe_and_bolourchi(flipped):
     """Whatever the order and the directions of the cells."""
     x, cells = arc(16, 100, np.pi / 4), None

@@ -192,6 +192,7 @@ SCENES = {
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.fast("1e6 g-balanced")
+@pytest.mark.fast_on_ranks()
 def test_no_step_ends_inside_out(name, accuracy, evaluations):
     """The run stops with a sentence, soon, and what it has accepted is not inside out."""
     system, integrator, dt, t_end = SCENES[name]()
@@ -248,7 +249,7 @@ def test_a_hard_impact_is_whole_or_named(name, accuracy):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_step_too_long_is_cut_back():
     """In one step the upper face passes the cube's middle, which short ones move in time."""
     runs = [
@@ -283,6 +284,7 @@ def test_on_request_it_goes_on_and_says_so(mpi_tmp_path):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("allowed", [False, True])
+@pytest.mark.fast_on_ranks()
 def test_statics(allowed):
     """A press beyond what the corners bear."""
     system = squeezed(0.9, 3, allow_inversion=allowed)
@@ -322,6 +324,8 @@ def test_contact_is_named_before_the_cell_that_it_crushes(pressed):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("held", [True, False], ids=["held", "on a plane"])
+@pytest.mark.fast("held")
+@pytest.mark.fast_on_ranks()
 def test_a_load_step_that_ends_nearly_inside_out_says_so(held, monkeypatch):
     """Newton's method ends there, or the relaxations; under 1 g, nothing is near it."""
     monkeypatch.setattr("dolfinx_nts.run.load_steps._RELAXATIONS", 10)

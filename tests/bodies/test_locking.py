@@ -53,6 +53,7 @@ def test_tetrahedra_are_told_of():
     assert "degree=2" in run.warnings["locking"].text and body.name in run.warnings["locking"].about
 
 
+@pytest.mark.slow
 def test_a_wave_is_no_locking():
     """Stress jumps at the front of a wave in the first steps, and little once it has spread."""
     ends = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
@@ -76,6 +77,7 @@ def test_a_wave_is_no_locking():
     s.close()
 
 
+@pytest.mark.slow
 def test_what_a_run_says_is_of_all_its_steps(tmp_path):
     """It goes on from one that ended in the midst of waves, and says what an unbroken run does."""
     mesh = create_box(COMM, ((0.0, 0.0, 0.0), (8.0, 1.0, 1.0)), (16, 2, 2), CellType.hexahedron)

@@ -76,6 +76,7 @@ def test_the_cantilever_of_reissners_equations(curved):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_bend_of_bathe_and_bolourchi():
     """On a curved mesh; elements of two nodes tend to the same, with order 2 (B27')."""
     section = nts.Section(EA=1e7, GA=(5e6,) * 2, GJ=1e7 / 12, EI=(1e7 / 12,) * 2, rhoA=1,

@@ -45,6 +45,7 @@ def block_on(kind, unit=1.0, sign=1.0, **options):
 
 @pytest.mark.parametrize("kind", ["plate", "plane"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.fast("1.0-plane", "-1.0-plane")
 def test_a_block_beside_a_plate_rests_on_it_at_once(kind, sign):
     for unit in (1.0, UNITS[0]):
         system = block_on(kind, unit, sign, friction=0.3, adjust=1.001 * GAP * unit)
@@ -75,6 +76,8 @@ def rubbing(adjust):
 
 
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.fast("integrator0")
+@pytest.mark.fast_on_ranks()
 def test_bodies_that_touch_across_a_gap_keep_momenta_and_energy(integrator):
     run = nts.simulate(rubbing(0.0501), integrator, dt=2e-3, t_end=0.06)
     assert run.status == "completed"

@@ -77,6 +77,7 @@ def test_energy_and_momenta(cells, degrees, integration, friction):
 
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
 @pytest.mark.parametrize("rule", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-10")
 def test_integrators(rule, cell):
     run = fly(thrown((cell, cell)), rule)
     if rule in CONTACT_RULES:
@@ -86,11 +87,13 @@ def test_integrators(rule, cell):
 
 
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
+@pytest.mark.fast("27")
 def test_a_rigid_master(cell):
     assert_kept(fly(thrown((cell, cell), rigid=True)))
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_restarted_run_is_the_uninterrupted_one(mpi_tmp_path):
     """On the same ranks, and on each alone."""
     path = mpi_tmp_path / "run.h5"
@@ -184,6 +187,16 @@ def stacked(cells, cell, degrees, integration):
 @pytest.mark.parametrize("cells", [(3, 2), (2, 3)], ids=str)
 @pytest.mark.parametrize("degrees", [(2, 2), (2, 1), (1, 2)], ids=str)
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
+@pytest.mark.fast(
+    "27-(2, 1)-(3, 2)",
+    "27-(2, 1)-(2, 3)",
+    "27-(1, 2)-(3, 2)",
+    "27-(1, 2)-(2, 3)",
+    "10-(2, 1)-(3, 2)",
+    "10-(2, 1)-(2, 3)",
+    "10-(1, 2)-(3, 2)",
+    "10-(1, 2)-(2, 3)",
+)
 def test_uniform_pressure_between_any_meshes(cell, degrees, cells):
     """Integrated over the slave's faces, with hats on its facets (theory 17.3)."""
     pressure, off = stacked(cells, cell, degrees, "surface")
@@ -251,6 +264,8 @@ def test_cantilever_on_a_roller(cell, within):
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
 @pytest.mark.parametrize("table", ["plane", "body"])
+@pytest.mark.fast("plane-27")
+@pytest.mark.fast_on_ranks()
 def test_a_sliding_block_decelerates_by_mu_g(cell, table):
     """At rest on its floor, its momentum falls by mu m g in each step."""
     mu, gravity, dt = 0.2, 9.81, 2e-3
@@ -286,6 +301,7 @@ def test_a_sliding_block_decelerates_by_mu_g(cell, table):
 @pytest.mark.parametrize("integration", ["nodes", "surface"])
 @pytest.mark.parametrize("inner", [True, False])
 @pytest.mark.fast_on_ranks("True-surface")
+@pytest.mark.fast("False-nodes", "False-surface")
 def test_press_fit(integration, inner):
     """Lame's pressure between two tubes, 6 and 5 curved cells a quarter, whichever is the slave.
 
@@ -315,6 +331,7 @@ def test_press_fit(integration, inner):
 # ---- edges, corners, itself
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
+@pytest.mark.fast("27")
 def test_crossed_edges(cell):
     """A cube on an edge falls across the edge of another: the edges alone touch."""
     low = turned(ON_EDGE, np.zeros(3), "low", cells=1, cell=cell, degree=2)
@@ -378,6 +395,8 @@ def test_a_curved_mesh():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["flexible", "rigid"])
+@pytest.mark.fast("rigid")
+@pytest.mark.fast_on_ranks()
 def test_a_curved_mesh_rolls_and_bounces(kind):
     """The curved ring falls on a plane; the nodes of its outer face are the slaves."""
     given = {"density": 1e3, "velocity": (0.5, 0.5, -2.0), "name": "ring"}

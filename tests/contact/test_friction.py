@@ -225,8 +225,8 @@ def plane_strain_slider(friction, integrator, speed=0.0):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize(("friction", "speed"), [(math.inf, 0.0), (0.5, 0.0), (0.2, 1.0)])
-@pytest.mark.fast("0.2-1.0-gonzalez contact", "inf-0.0-midpoint")
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("inf-0.0-midpoint")
 def test_prescribed_tangential_direction_carries_no_force(friction, speed, integrator):
     stepper = plane_strain_slider(friction, integrator, speed)
     state = stepper.state

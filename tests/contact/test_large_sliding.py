@@ -129,7 +129,7 @@ def assert_slides_straight(h, velocity, tolerance, mu=MU):
 # ---- over facets
 @pytest.mark.parametrize("facets", FACETS)
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("energy-momentum-quads")
+@pytest.mark.slow
 def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
     """Every facet starts at another corner than its neighbour."""
     body, face = plate(facets)
@@ -330,7 +330,7 @@ def assert_coulomb(h, acceleration, mu=MU):
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-squares")
+@pytest.mark.slow
 def test_slides_off_and_lands_on_another_plate(integrator, facets):
     """Two masters, one lower and beside the other: slide, flight, bounces, slide."""
     upper = plate(facets, (-1, -1), (0, 1), 0.0, (4, 8), "upper")
@@ -353,7 +353,7 @@ def test_slides_off_and_lands_on_another_plate(integrator, facets):
 
 @pytest.mark.parametrize("start", [-0.505, -0.5, -0.49])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum--0.5")
+@pytest.mark.slow
 def test_two_masters_side_by_side_are_one(integrator, start):
     """Over their seam the gap is closed twice, and carries once."""
     plates = [plate("squares", (k - 1, -1), (k, 1), n=(4, 8), name=f"plate{k}") for k in (0, 1)]
@@ -377,7 +377,7 @@ class Crane(PointMass):
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-squares")
+@pytest.mark.slow
 def test_leaves_the_surface_beyond_its_rim_and_comes_back(integrator, facets):
     body, face = plate(facets)
     start = (0.3, 0.17, 0.0)
@@ -445,8 +445,8 @@ def test_drawn_along_it_loses_its_motion_across(integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-True", "midpoint-False")
 @pytest.mark.fast_on_ranks("energy-momentum-True")
+@pytest.mark.fast("energy-momentum-True")
 def test_far_away_and_on_ranks_without_facets(integrator, condense):
     """A plate of one cell, which one rank owns, and another that nothing comes near."""
     near = plate(n=(1, 1), name="near")
@@ -502,6 +502,7 @@ def falling_cube(tilt, velocity):
     ],
 )
 @pytest.mark.fast("0.191-velocity0")
+@pytest.mark.fast_on_ranks()
 def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(tilt, velocity):
     """Stuck it would be drawn down, free it would pass the plane, and Newton flips between them."""
     newton = nts.Newton(max_retries=0)

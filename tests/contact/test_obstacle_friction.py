@@ -232,7 +232,7 @@ def shaken(name, scene=None, metre=1.0, integrator="energy-momentum", bounce=Fal
 
 @pytest.mark.parametrize("bounce", [False, True])
 @pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("plane-True", "cylinder-False")
+@pytest.mark.fast("plane-True")
 def test_ledger(name, bounce):
     _, _, rows = shaken(name, bounce=bounce, newton=TO_ROUNDING)
     top = np.abs(rows["energy"]).max()
@@ -246,8 +246,7 @@ def test_ledger(name, bounce):
 # ---- bodies
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("energy-momentum")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_block_slides_on_a_plane_as_on_a_plate(integrator):
     tables, ends = [], []
     for meshed in (True, False):

@@ -153,7 +153,7 @@ def test_rebound_from_a_plane(integrator, theta):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_plane_is_a_fixed_facet(integrator):
     """Bouncing obliquely under gravity: the same path as on the face of a fixed hexahedron."""
     start, velocity, gravity = np.array([0.3, 0.2, 0.04]), (0.4, -0.7, -SPEED), (0, 1.0, -30.0)
@@ -310,8 +310,7 @@ def test_a_floor_that_flees_does_not_pull():
 # ---- bodies
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("midpoint")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
     gravity, tables, ends = (0.0, 0.0, -9.81), [], []
     for meshed in (True, False):

@@ -112,6 +112,8 @@ def of_two(where, friction=0.0):
     ("friction", "skew", "where"),
     [(0.0, 0.4, inner), (0.4, 0.0, inner), (0.0, 0.0, everywhere), (0.4, 0.4, everywhere)],
 )
+@pytest.mark.fast("0.0-0.0-everywhere")
+@pytest.mark.fast_on_ranks()
 def test_legs_pressed_together_are_two_bodies(friction, skew, where):
     """Nodes of one leg are held, not those of both: else flat parts would be held twice."""
     one, two = (
@@ -138,6 +140,7 @@ def closing(x):
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.Midpoint()])
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("rule1")
 def test_legs_that_hit_each_other_are_two_bodies(rule):
     one, two = (
         nts.simulate(
@@ -186,6 +189,7 @@ def check_momenta(table):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_fold_keeps_momenta_and_the_ledger(flown):
     check_momenta(flown)
     energy = flown["energy"][0]
@@ -375,6 +379,7 @@ def candidates(mesh):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_what_lies_beside_a_node_does_not_count():
     """Neither do the other side of a plate, edges and corners, and a fold that is wide."""
     assert candidates(box(cells=4)) == 0

@@ -121,8 +121,7 @@ def assert_closed(table, changes, count):
 @pytest.mark.parametrize(
     "variant", [pytest.param("middle", marks=pytest.mark.mpi), "start", "smooth"]
 )
-@pytest.mark.fast("middle")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
     changes, others, table = slide("flat", variant, 0.45, facets=80, uneven=0.25)
     assert_closed(table, changes, 50)
@@ -211,7 +210,7 @@ def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0, arch=False):
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("smoothing", [False, True])
-@pytest.mark.fast("True-hexahedron")
+@pytest.mark.slow
 def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
     tables = []
     for comm in (COMM, MPI.COMM_SELF):

@@ -157,8 +157,8 @@ def test_impacts_keep_the_ledger_and_the_momenta(case):
 @pytest.mark.parametrize(
     "case", ["shell on continuum", "rigid on beam", "shell on shell", "rigid on shell"]
 )
-@pytest.mark.fast("shell on continuum", "rigid on beam")
 @pytest.mark.fast_on_ranks("rigid on beam")
+@pytest.mark.fast("rigid on beam")
 def test_what_is_hit_sleeps_until_then(case):
     """Beams, shells and rigid bodies, with what holds their directors; the motion is the same."""
     ends = []

@@ -52,7 +52,7 @@ def through(x, d, triangle):
 
 @pytest.mark.parametrize("corners", [3, 4])
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.fast("0-3", "1-4")
+@pytest.mark.fast("0-3")
 def test_first_hits_against_all_pairs(corners, seed):
     random = np.random.default_rng(seed)
     origin, side = random.uniform(-1, 1, (40, 3)), 0.5 * random.normal(size=(40, 2, 3))
@@ -141,7 +141,7 @@ def test_no_path_slips_through_a_sheet_that_crumples(corners):
 
 
 @pytest.mark.parametrize("corners", [3, 4])
-@pytest.mark.fast("3")
+@pytest.mark.slow
 def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
     """Roots of numpy of the polynomial through four of its values."""
     random = np.random.default_rng(corners)
@@ -241,6 +241,7 @@ def test_a_shot_at_a_small_obstacle(obstacle):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast("midpoint")
 def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator):
     """It passes the plate's edge, sinks below its top, and the plate moves over it and away."""
     def sideways(t):
@@ -286,8 +287,7 @@ def test_each_contact_tells_of_its_own_nodes_beside_the_plate():
         ("midpoint", "exact", 2e-3, 4), ("midpoint", "balanced", 5e-4, 3),
     ],
 )  # fmt: skip
-@pytest.mark.fast("energy-momentum-balanced-0.002-4")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_cubes_off_centre_win_no_energy(integrator, accuracy, dt, n):
     """Slaves that passed below the master's rim and came back won half the energy."""
     bodies = [
@@ -457,6 +457,7 @@ def test_a_shot_at_a_thin_flexible_plate(speed, integrator, accuracy):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 @pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast("midpoint")
 def test_a_block_at_rest_over_a_soft_plate(integrator):
     """6 mm above facets of 1 cm, in steps of 50 ms: the first steps see no motion to come."""
     size, gap = 0.02, 6e-3

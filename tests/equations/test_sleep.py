@@ -102,7 +102,7 @@ def assert_same(a, b, dt=DT):
     ids=["exact", "reuse"],
 )
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-reuse")
+@pytest.mark.slow
 def test_cubes_sleep_until_they_are_reached(integrator, newton):
     a, b, awake = both(row, 12, integrator=integrator, **newton)
     assert awake[0] == "a" and awake[-1] == "abc" and sorted(awake) == awake
@@ -114,7 +114,7 @@ def test_cubes_sleep_until_they_are_reached(integrator, newton):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_friction_beside_a_sleeper():
     a, b, awake = both(lambda: row(friction=(0.1, 0.0, 0.2)), 8, condense=True)
     assert awake[-1] == "abc" and a.solution.balance["slip"].max() > 0
@@ -166,6 +166,7 @@ def count(body, names, calls):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
     system, calls = row(), []
     s = nts.Stepper(system, nts.EnergyMomentum(), sleep=True)
@@ -272,7 +273,7 @@ MOVERS = {
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", MOVERS)
 @pytest.mark.fast("later body force", "later traction", "later support", "extra form")
-@pytest.mark.fast_on_ranks("later support")
+@pytest.mark.fast_on_ranks()
 def test_loads_wake_in_the_step_in_which_they_act(name):
     a, b, awake = both(beside(**MOVERS[name]), STEPS)
     assert awake == (["a"] * 3 + ["ab"] * 3 if "later" in name else ["ab"] * STEPS)
@@ -307,6 +308,7 @@ def test_gravity_keeps_awake_what_can_fall():
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_an_obstacle_wakes_what_it_reaches(integrator):
     """A wall that touches, and sets out later."""
 
@@ -347,6 +349,7 @@ def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_motion_beyond_the_first_search_wakes_in_the_same_step():
     """Nothing at the start of the step tells how far the force will push."""
     dt, gap = 0.2, 0.2

@@ -90,6 +90,7 @@ def test_atwoods_machine(rule, friction):
 
 
 @rules
+@pytest.mark.fast("energy-momentum")
 def test_a_slack_cable_stops_a_weight_as_a_limit_does(rule):
     """Free fall until it is taut; then as a slider on a rail with an end, with the same loss."""
     load, cable, system = hung(length=WAY + 0.3)
@@ -176,6 +177,8 @@ def test_a_winch_stretches_a_spring_in_equilibrium():
 
 @rules
 @pytest.mark.parametrize("stiffness", [None, 1e4])
+@pytest.mark.fast("10000.0-midpoint")
+@pytest.mark.fast_on_ranks()
 def test_a_winch_lifts_a_weight_in_motion(rule, stiffness):
     """It winds h as t^2; work of the winch and of gravity is the kinetic and stored energy."""
     load, cable, system = hung(axial_stiffness=stiffness, length=lambda t: WAY - 0.2 * t**2)
@@ -410,6 +413,7 @@ def test_tension_is_the_mean_between_two_ends():
 
 @pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
 @pytest.mark.parametrize("force", [0.4, -0.5])
+@pytest.mark.fast("0.4-newmark", "0.4-generalized-alpha", "-0.5-newmark", "-0.5-generalized-alpha")
 def test_tangent_is_the_derivative_of_the_residual(rule, force):
     """With sticking and slipping eyelets, taut and slack; at moved places."""
     elastic = rule in ACCELERATED.values()

@@ -59,6 +59,8 @@ def assert_closed(run):
 @pytest.mark.parametrize(
     ("rule", "unit"), zip(MID_STEP.values(), (1.0, 1e-3), strict=True), ids=MID_STEP
 )
+@pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_friction_stops_a_disc(rule, unit):
     """omega = omega_0 - b t/I, until it stands; all of its energy is dissipated."""
     bound, spin = 0.3 * unit**5, 5.0
@@ -118,6 +120,7 @@ def test_a_pendulum_rests_on_its_limit():
     assert rest.reactions["hinge limits"][-1, 1, 1] == pytest.approx(-moment, rel=1e-9)
 
 
+@pytest.mark.fast_on_ranks()
 def test_a_pendulum_bounces_on_its_limit_until_friction_has_it():
     """It never passes the limit, and gains nothing there; at rest, friction and limit carry it."""
     seen = []
@@ -135,6 +138,8 @@ def test_a_pendulum_bounces_on_its_limit_until_friction_has_it():
 
 
 @rules
+@pytest.mark.fast("midpoint")
+@pytest.mark.fast_on_ranks()
 def test_a_slider_with_friction_and_an_end(rule):
     """It slides v^2/(2 b/m) on the level; on a slope it ends at its limit."""
     body, axis, system = slider(0.0, 2.0, friction=nts.JointFriction(bound=3.0))
@@ -148,6 +153,7 @@ def test_a_slider_with_friction_and_an_end(rule):
 
 
 @pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
+@pytest.mark.fast("generalized-alpha")
 def test_a_controller_holds_an_angle(rule):
     """T = -k (a - a_0) - d da/dt rests where k (a - a_0) is the moment of the weight."""
     stiff, damping, wanted = 50.0, 10.0, 0.3
@@ -179,6 +185,7 @@ def spinning(**laws):
 
 
 @rules
+@pytest.mark.slow
 def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
     """Friction that brakes both, each after v^2 m/(2 b); a motor that makes it a screw."""
     friction = {
@@ -206,6 +213,7 @@ def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
 
 @rules
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.fast("1.0-energy-momentum")
 def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
     """A pendulum on a ball joint with a damper comes to rest 0.4 rad below the horizontal."""
     body = nts.RigidBody.from_inertia(
@@ -227,6 +235,7 @@ def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
 
 
 @pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
+@pytest.mark.fast("energy-momentum")
 def test_actuators_make_an_oscillator(rule):
     """T = -k a about an axis, F = -k (l - l_0) along a line: half a period, by the second order."""
     stiff, start = 0.2, 0.5

@@ -135,7 +135,7 @@ def test_an_energy_that_is_linear_is_a_linear_spring():
 
 @pytest.mark.parametrize("rule", INTEGRATORS)
 @pytest.mark.parametrize("damping", [0.0, 1.5])
-@pytest.mark.fast("0.0-midpoint", "1.5-energy-momentum", "1.5-generalized-alpha")
+@pytest.mark.fast("0.0-midpoint")
 def test_oscillator(rule, damping):
     """Order, and what the damper takes, by the closed form; ends change places."""
     m, k, start, v0, end = 2.0, 30.0, 0.3, 0.8, 1.6
@@ -278,6 +278,7 @@ def test_two_wheels_on_one_axis():
     assert abs(np.log2(errors[0] / errors[1]) - 2.0) < 0.1
 
 
+@pytest.mark.slow
 def test_an_angle_counts_turns_from_where_a_run_goes_on():
     def scene():
         wheel = nts.RigidBody.from_inertia(1.0, (0.3, 0.4, 0.5), angular_velocity=(0, 0, 9.0))
@@ -360,6 +361,7 @@ def test_a_spring_within_a_flexible_body():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_rigid_body_on_a_flexible_one():
     body, ball = cube(velocity=(0.3, 0.0, 0.0)), mass((0.5, 0.5, 2.0), angular_velocity=(3, 2, 1))
     points = [(0.4, 0.5, 1.0), (0.6, 0.5, 1.7)]
@@ -628,6 +630,7 @@ def test_a_damper_that_steps_do_not_resolve_is_told(rule):
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.GeneralizedAlpha()])
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.fast_on_ranks()
 def test_a_stiff_damper_that_is_right_is_not_told(rule, unit):
     """Pulled from rest by F and by F sin(omega t) at c h/m = 100 it has gone F t/c, (1 - cos)/c."""
     c, omega = 1e4, 20.0
@@ -662,6 +665,7 @@ def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
 @pytest.mark.mpi
 @pytest.mark.parametrize("stiffness", [1e4, 1e9])
 @pytest.mark.fast_on_ranks("1000000000.0")
+@pytest.mark.fast("1000000000.0")
 def test_a_body_at_rest_on_an_unstretched_spring_stays_there(stiffness):
     """The spring's force is the rounding of its length, which nothing else in the scene exceeds."""
     low = np.array([3.0, 0.0, 0.0])

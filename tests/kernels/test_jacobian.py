@@ -118,7 +118,7 @@ class Linearised:
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize(("cell", "friction", "active"), SCENES)
 @pytest.mark.parametrize("rule", ["energy-momentum", "condensed"])
-@pytest.mark.fast("energy-momentum-hex-none-mixed", "condensed-hex-stick-all")
+@pytest.mark.fast("condensed-hex-stick-all")
 def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
     at = Linearised(system, rule, active, rotated_state(system))
@@ -164,7 +164,7 @@ def test_jacobian_of_a_law_after_sums(rule, cell, friction):
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("rule", EQUATIONS)
-@pytest.mark.fast("energy-momentum", "static")
+@pytest.mark.fast("static")
 def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
@@ -362,8 +362,8 @@ def test_newton_converges_quadratically_with_friction(cell, rule, states):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.fast("hex", "curved")
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("hex")
 def test_condensing_changes_no_solution(cell):
     results = []
     for rule in ("energy-momentum", "condensed"):

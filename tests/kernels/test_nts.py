@@ -268,6 +268,7 @@ def random_gaps(rng, n, nc):
 
 
 @pytest.mark.parametrize("nc", KINDS)
+@pytest.mark.fast("3", "4", "16")
 def test_gap_and_its_derivatives(nc):
     """The second one along any direction."""
     rng, rows = np.random.default_rng(8), 8 if nc < 15 else 1

@@ -167,6 +167,7 @@ def test_ledger_of_a_body_that_hardly_moves(name):
 
 
 @pytest.mark.parametrize("dt", [1e-4, 1e-5])
+@pytest.mark.fast("0.0001")
 def test_floor_of_short_steps_is_rounding(dt):
     """Where forces are rounded like displacements, not like positions, the ledger stays closed."""
     mesh = create_unit_cube(MPI.COMM_SELF, 2, 1, 1, CellType.hexahedron)
@@ -219,6 +220,7 @@ def test_ledger_of_a_slow_impact(speed):
 @pytest.mark.mpi
 @pytest.mark.parametrize("away", [1e6, 1e10])
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("1000000.0")
 def test_ledger_far_from_the_origin(away):
     """What the mesh's own rounding leaves of the cubes is as exact as at the origin."""
     assert impact(2.0, 0.05, away) < 1e-11

@@ -69,8 +69,7 @@ def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, heig
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
-@pytest.mark.fast("balanced")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_flexible_cubes_keep_energy_and_momenta(accuracy):
     """The published scheme loses 8 % of it at this mesh."""
     energy = []
@@ -245,6 +244,7 @@ def test_a_bouncing_ball_rises_by_its_restitution(restitution):
     assert lost == pytest.approx(size * (1.0 - gravitational[-1]), rel=1e-9, abs=1e-11 * size)
 
 
+@pytest.mark.slow
 def test_a_ball_without_restitution_stays_where_it_falls():
     """B24 at e = 0: what its fall brought is lost, and it lies there."""
     height, gravity = 0.1, 9.81

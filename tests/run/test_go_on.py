@@ -17,8 +17,7 @@ DT = 2e-3
 
 @pytest.mark.parametrize(("first_steps", "steps"), [(12, 20), (13, 23)], ids=["12", "13"])
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast_on_ranks()
-@pytest.mark.fast("energy-momentum-13")
+@pytest.mark.slow
 def test_two_parts_are_the_whole(integrator, first_steps, steps):
     """With friction, in contact where the first one ends; on several ranks MUMPS rounds anew."""
     newton = nts.Newton(linear_solver="direct", condense=True)
@@ -40,6 +39,7 @@ def test_two_parts_are_the_whole(integrator, first_steps, steps):
 
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast("midpoint")
 def test_forces_of_supports_and_contacts(integrator):
     """Impulses of supports, floor and gravity add up to the change of momentum."""
     mesh = create_box(

@@ -159,8 +159,7 @@ def test_constant_values_of_conditions_act_at_once_in_statics():
 
 
 @pytest.mark.parametrize("young", [1e1, 1e4])
-@pytest.mark.fast("10.0")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_stiff_body_on_a_soft_one_is_held(young):
     """Steel that sticks to a pad whose base is fixed: soft is not free."""
     mesh = create_box(
@@ -269,6 +268,7 @@ def test_restored_impulses_have_no_friction_and_say_so(friction):
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.fast_on_ranks("0.3")
+@pytest.mark.fast("0.3")
 def test_a_weight_below_the_rounding_of_a_stiff_body_is_told(friction):
     """Dust on steel: the weight of 5e-9 N is lost in the forces of the plate's nodes."""
     steel, soft = (nts.NeoHookean(young, 0.3) for young in (2e11, 0.1))
