@@ -42,8 +42,8 @@ LONG = {
     "test_stability", "test_docs", "test_demo_output", "test_unwritten", "test_massless",
     "test_demo_blocks", "test_demo_stability", "test_conformance", "test_impacts", "test_tradeoff",
 }  # fmt: skip
-#: On several ranks one fast and one slow case of a test run, and others in the next week. All of them
-#: run in serial, and what ranks do seldom depends on the case.
+#: On several ranks one fast and one slow case of a test run, others in the next week. In serial all
+#: of them run, and what ranks do seldom depends on the case.
 WEEK = datetime.date.today().isocalendar().week
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
