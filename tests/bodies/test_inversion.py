@@ -7,11 +7,11 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import two_blocks
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
 from integrators import MID_STEP
 from measures import OPEN, PROMISED, ledger_or_word
 from point_mass import PointMass
-from scenes import RUBBER, green, saint_venant
+from scenes import RUBBER, box, green, saint_venant
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -26,16 +26,13 @@ SENTENCE = "inside out, which W(C) cannot see: det F = "
 
 
 def cube(n=2, size=(1.0, 1.0, 1.0), comm=COMM, cell=CellType.hexahedron, **options):
-    mesh = create_box(comm, [[0, 0, 0], size], [n] * 3, cell, ghost_mode=GhostMode.shared_facet)
+    mesh = box([0, 0, 0], size, n, cell, comm=comm)
     return nts.Continuum(mesh, RUBBER, density=1e3, **({"name": "cube"} | options))
 
 
 def form_cube(n=2, **options):
     """A cube of forms of a user's own."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 1]], [n] * 3, CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(cells=n)
     space = compat.vector_space(mesh, 1)
     return nts.FormBody(
         space, saint_venant(2e5, 0.3), strain=green, density=1e3, name="cube", **options

@@ -4,8 +4,9 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from rotations import rotation
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -15,7 +16,7 @@ COMM = MPI.COMM_WORLD
 def bar(cells, poisson, *, height=1.0, kind=CellType.hexahedron, **options):
     """A bar of length 10 and width 1 that a small load bends, and its equilibrium."""
     ends = ((0.0, 0.0, 0.0), (10.0, 1.0, height))
-    mesh = create_box(COMM, ends, cells, kind, ghost_mode=GhostMode.shared_facet)
+    mesh = box(*ends, cells, kind)
     body = nts.Continuum(
         mesh, nts.NeoHookean(young=1.0, poisson=poisson), density=1.0,
         bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],

@@ -7,7 +7,7 @@ from mpi4py import MPI
 import noise
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
 from integrators import CONTACT_RULES
 from measures import difference
 from pairs import pairs
@@ -200,7 +200,7 @@ def plane_strain_slider(friction, integrator, speed=0.0):
     rubber = nts.NeoHookean(young=1e6, poisson=0.3)
     kind = CellType.hexahedron
     meshes = [
-        create_box(COMM, [low, high], n, kind, ghost_mode=GhostMode.shared_facet)
+        box(low, high, n, kind)
         for low, high, n in (
             ([0.2, 0, 0], [0.8, 0.5, 0.3], [3, 2, 1]),
             ([-1, -0.5, 0], [2, 0, 0.3], [4, 1, 1]),

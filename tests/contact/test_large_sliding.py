@@ -10,6 +10,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from integrators import CONTACT_RULES, MID_STEP
 from pairs import pairs
 from point_mass import MASS, PointMass, PointSurface, Sledge
+from scenes import box
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
@@ -46,9 +47,7 @@ FACETS = {
 def plate(facets="squares", low=(-1.0, -1.0), high=(1.0, 1.0), top=0.0, n=(8, 8), name="plate"):
     """A plate that does not move, and its upper face."""
     cell, shape = FACETS[facets]
-    mesh = create_box(
-        COMM, [[*low, top - 0.2], [*high, top]], [*n, 1], cell, ghost_mode=GhostMode.shared_facet
-    )
+    mesh = box([*low, top - 0.2], [*high, top], [*n, 1], cell)
     x, y, _ = mesh.geometry.x.T
     mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = shape(x, y)
     everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
@@ -208,10 +207,7 @@ def test_zero_gap_without_force_is_without_friction(integrator, velocity, fricti
 # ---- a curved surface
 def saddle(height):
     """Facets on z = height x y, which bilinear ones hold exactly."""
-    mesh = create_box(
-        COMM, [[-1, -1, -0.5], [1, 1, 0]], [4, 4, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([-1, -1, -0.5], [1, 1, 0], [4, 4, 1])
     top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     one = np.full(len(top), 1, np.int32)
     tags = meshtags(mesh, 2, np.sort(top), one)
@@ -260,10 +256,7 @@ def test_sliding_over_a_saddle_is_of_second_order(integrator):
 # ---- a block over many facets
 def settled_block(facets, friction):
     """A small block thrown over a long plate that it rests on, and the state it starts from."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [0.1, 0.1, 0.05]], [2, 2, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, 0], [0.1, 0.1, 0.05], [2, 2, 1])
 
     def on_plate(held):
         block = nts.Continuum(
@@ -474,10 +467,7 @@ def test_far_away_and_on_ranks_without_facets(integrator, condense):
 # ---- Newton's iteration
 def falling_cube(tilt, velocity):
     """A stiff cube whose lower edge touches a plane; velocity: v, and its slopes in z, z, x, y."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [0.2] * 3], [1, 1, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, 0], [0.2] * 3, 1)
     x, y, z = mesh.geometry.x.T
     x, z = np.cos(tilt) * x + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * x
     mesh.geometry.x[:] = np.column_stack([x, y, z + np.sin(tilt) * 0.2])

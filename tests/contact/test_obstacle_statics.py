@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from scenes import YOUNG, at, box, everywhere, quarter_cube, rubber_stress
 
 import dolfinx_nts as nts
@@ -33,10 +33,7 @@ def test_a_plane_presses_like_a_prescribed_face():
 
 
 def on_floor(friction, shift):
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 0.5]], [3, 3, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, 0], [1, 1, 0.5], [3, 3, 2])
     top = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, value=lambda t: (shift * t, 0, -0.02 * t))
     body = nts.Continuum(
         mesh, nts.NeoHookean(young=1e5, poisson=0.3), density=1e3, bcs=[top], name="block"

@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL, differences
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, wall
+from scenes import box
 from scenes_obstacles import (
     ACCELERATION,
     CENTRE,
@@ -316,10 +316,7 @@ def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
     for meshed in (True, False):
         body, face = block()
         if meshed:
-            mesh = create_box(
-                COMM, [[-1, -1, -1], [2, 2, 0]], [3, 3, 1], CellType.hexahedron,
-                ghost_mode=GhostMode.shared_facet,
-            )  # fmt: skip
+            mesh = box([-1, -1, -1], [2, 2, 0], [3, 3, 1])
             hold = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
             plate = nts.Continuum(
                 mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1e3, bcs=[hold], name="plate"

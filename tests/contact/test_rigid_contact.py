@@ -4,9 +4,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from scenes import everywhere
+from scenes import box, everywhere
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
@@ -20,10 +19,7 @@ G = 9.81
 
 def grid(low, size, n, turn=None):
     low = np.array(low, dtype=float)
-    mesh = create_box(
-        COMM, [low, low + np.array(size)], list(n), CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(low, low + np.array(size), list(n))
     if turn is not None:
         mesh.geometry.x[:] = mesh.geometry.x @ Rotation.from_rotvec(turn).as_matrix().T
     return mesh

@@ -156,47 +156,6 @@ def test_legs_that_hit_each_other_are_two_bodies(rule):
     assert difference(one.balance, two.balance) < 1e-10
 
 
-# ---- a U that flies
-def thrown(friction=0.4, skew=0.4):
-    """The U, whose legs close while it flies and spins."""
-
-    def velocity(x):
-        v = np.cross([0.3, 0.2, 1.0], x.T).T + np.array([[1.0], [0.5], [-0.2]])
-        v[1] -= 5.0 * np.sign(x[1]) * np.clip(x[0] / LENGTH, 0.0, 1.0)
-        return v
-
-    mesh = strip(skew, width=2)
-    rubber = nts.NeoHookean(**RUBBER)
-    body = nts.Continuum(mesh, rubber, density=1e3, velocity=velocity, name="strip")
-    contact = nts.SelfContact(body.surface(everywhere), friction=friction)
-    return nts.System([body], contacts=[contact])
-
-
-@pytest.fixture(scope="module")
-def flown():
-    """Its balance by the energy-momentum scheme."""
-    run = nts.simulate(thrown(), nts.EnergyMomentum(), dt=4e-3, t_end=0.1)
-    assert run.status == "completed" and not kinds(run)
-    return run.balance
-
-
-def check_momenta(table):
-    assert table["active"].max() >= 8
-    for name in ("linear_momentum", "angular_momentum"):
-        off = np.abs(table[name] - table[name][0]).max()
-        assert off < 1e-12 * np.abs(table[name][0]).max(), name
-    assert table["min_gap"].min() > -1e-10
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
-def test_a_fold_keeps_momenta_and_the_ledger(flown):
-    check_momenta(flown)
-    energy = flown["energy"][0]
-    assert flown["friction_dissipation"][-1] > 1e-3 * energy
-    assert np.abs(flown["ledger_residual"]).max() < 1e-11 * energy
-
-
 # ---- what nothing holds is told
 @pytest.mark.mpi
 @pytest.mark.parametrize("where", [inner, everywhere])

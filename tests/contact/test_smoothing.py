@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from point_mass import PointSurface, Sledge
-from scenes import UNITS
+from scenes import UNITS, box
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.skins import locate_facets
@@ -25,10 +25,7 @@ def plate(shape, facets, uneven, triangles=False):
     Quadrilaterals in a row, or triangles in three rows.
     """
     cells, kind = (3, CellType.tetrahedron) if triangles else (1, CellType.hexahedron)
-    mesh = create_box(
-        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, cells, 1], kind,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([-END, -0.1, -0.1], [END, 0.1, 0.0], [facets, cells, 1], kind)
     top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     tags = meshtags(
         mesh, 2, np.sort(top), np.full(len(top), 1, np.int32)

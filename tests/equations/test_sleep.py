@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from point_mass import PointMass
-from scenes import UNITS
+from scenes import UNITS, box
 
 import dolfinx_nts as nts
 
@@ -20,10 +20,7 @@ DT = 2e-3
 def cube(low, name, *, cells=2, metre=1.0, **options):
     """A unit cube at rest unless said otherwise."""
     low = metre * np.asarray(low, dtype=float)
-    mesh = create_box(
-        COMM, [low, low + metre], [cells] * 3, CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(low, low + metre, cells)
     rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
     return nts.Continuum(mesh, rubber, density=1e2 / metre**3, name=name, **options)
 
@@ -377,10 +374,7 @@ def test_a_material_that_changes_wakes():
     """A body at rest that swells as soon as a parameter of its energy says so."""
 
     def moved(sleep):
-        mesh = create_box(
-            COMM, [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [2, 2, 2], CellType.hexahedron,
-            ghost_mode=GhostMode.shared_facet,
-        )  # fmt: skip
+        mesh = box([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], 2)
         swells, base = fem.Constant(mesh, 0.0), nts.StVenantKirchhoff(young=1e4, poisson=0.3)
         body = nts.Continuum(mesh, lambda c: base(c) - swells * ufl.tr(c), density=1e2)
         # The first of bodies that all rest stays awake.

@@ -4,10 +4,9 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import ACCELERATED, INTEGRATORS, MID_STEP
 from measures import differences
-from scenes import RUBBER
+from scenes import RUBBER, box
 
 import dolfinx_nts as nts
 from dolfinx_nts.kernels.cable import Lengths, Stretched, turns
@@ -329,10 +328,7 @@ def test_block_and_tackle_with_friction(rule, held):
 
 def flying(**options):
     """Two rigid bodies and a block of rubber, which has two eyelets, at one cable; no support."""
-    mesh = create_box(
-        COMM, [[1.0, -0.2, -0.2], [1.6, 0.2, 0.2]], [3, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([1.0, -0.2, -0.2], [1.6, 0.2, 0.2], [3, 2, 2])
     block = nts.Continuum(mesh, RUBBER, density=20.0, name="block", velocity=(0, 0.3, 1.0))
     a = weight(2.0, (0, 0, 0), "a", velocity=(-1.0, 0, 0.5), angular_velocity=(0.4, 2.0, 1.0))
     b = weight(1.0, (2.5, 0, 0.2), "b", velocity=(2.0, 1.0, 0), angular_velocity=(1.0, 0, 2.0))

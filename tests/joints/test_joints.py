@@ -6,9 +6,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from scenes import UNITS
+from scenes import UNITS, box
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
@@ -564,10 +563,7 @@ def test_the_work_of_a_drive_is_that_of_its_motion():
 # ---- flexible bodies
 def cube(low, name, cells=2, **options):
     low = np.asarray(low, dtype=float)
-    mesh = create_box(
-        COMM, [low, low + 1.0], [cells] * 3, CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(low, low + 1.0, cells)
     return nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1.0, name=name, **options)
 
 

@@ -6,11 +6,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS
 from measures import kinds
 from pairs import pairs
-from scenes import UNITS
+from scenes import UNITS, box
 from scipy.integrate import quad, solve_ivp
 
 import dolfinx_nts as nts
@@ -46,10 +45,7 @@ POINTS = [(0.5, 0.3, -0.2), (2.2, 0.1, 0.4)]
 
 
 def cube(side=1.0, **options):
-    mesh = create_box(
-        COMM, [np.zeros(3), np.full(3, side)], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box((0, 0, 0), np.full(3, side), 2)
     return nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1e3, name="cube", **options)
 
 
@@ -669,9 +665,7 @@ def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
 def test_a_body_at_rest_on_an_unstretched_spring_stays_there(stiffness):
     """The spring's force is the rounding of its length, which nothing else in the scene exceeds."""
     low = np.array([3.0, 0.0, 0.0])
-    mesh = create_box(
-        COMM, [low, low + 0.5], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
-    )
+    mesh = box(low, low + 0.5, 2)
     body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3)
     ends = [(3.5, 0.25, 0.25), (5.0, 0.25, 0.25)]
     spring = nts.Spring(body, None, points=ends, stiffness=stiffness)

@@ -4,10 +4,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from measures import drift
 from pairs import pairs
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -17,10 +17,7 @@ FLOOR = nts.Plane((0, 0, 0), (0, 0, 1))
 
 def grid(low, size, n):
     low = np.array(low, dtype=float)
-    return create_box(
-        COMM, [low, low + np.array(size)], list(n), CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    return box(low, low + np.array(size), list(n))
 
 
 def cubes(friction=None, gap=0.05, **speeds):

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from lines import interval_mesh
 from point_mass import MASS, SPEED, STEP, mass_on_wall
 from scenes import CELLS, at, box, everywhere
@@ -162,10 +162,7 @@ def test_constant_values_of_conditions_act_at_once_in_statics():
 @pytest.mark.slow
 def test_a_stiff_body_on_a_soft_one_is_held(young):
     """Steel that sticks to a pad whose base is fixed: soft is not free."""
-    mesh = create_box(
-        COMM, [np.array([0, 0, -0.5]), np.array([1.0, 1.0, 0.0])], [2, 2, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, -0.5], [1.0, 1.0, 0.0], [2, 2, 1])
     pad = nts.Continuum(
         mesh, nts.NeoHookean(young, 0.3), density=1e3, name="pad",
         bcs=[nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)],
