@@ -205,7 +205,7 @@ def more_joints(frame):
 
 
 def sewn(frame):
-    """Two shells that meet at right angles in a seam, one of them clamped."""
+    """Two shells that meet at 68 degrees in a seam, one of them clamped."""
     given = {
         "young": frame.size(1e7, 2), "poisson": 0.3, "thickness": frame.size(0.03, 1),
         "density": DENSITY,
@@ -214,6 +214,8 @@ def sewn(frame):
     mesh = frame.grid("quadrilateral", (0, 0, 0), (1, 0.5, 0), (4, 2))
     flange = nts.Shell(mesh, bcs=[clamp], name="flange", **given)
     mesh = frame.grid("quadrilateral", (0, 0, 0.5), (0.5, 0.4, 0.5), (2, 2), axes=(1, 2, 0))
+    x, y, z = frame.back(mesh.geometry.x).T
+    mesh.geometry.x[:] = frame.place(np.column_stack([x + 0.4 * z, y, z]))
     web = nts.Shell(mesh, name="web", **given)
     edge = web.surface(frame.where(lambda x: x[:, 2] < 1e-6), side="edge")
     return nts.System([flange, web], joints=[nts.Seam(flange, edge)], gravity=_gravity(frame))
