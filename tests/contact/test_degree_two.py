@@ -332,6 +332,7 @@ def test_press_fit(integration, inner):
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
 @pytest.mark.fast("27")
+@pytest.mark.fast_on_ranks()
 def test_crossed_edges(cell):
     """A cube on an edge falls across the edge of another: the edges alone touch."""
     low = turned(ON_EDGE, np.zeros(3), "low", cells=1, cell=cell, degree=2)

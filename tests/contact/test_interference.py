@@ -272,6 +272,7 @@ def widened(unit, push, **options):
 
 @pytest.mark.parametrize("unit", [1.0, 2.0**-10])
 @pytest.mark.fast("0.0009765625")
+@pytest.mark.fast_on_ranks()
 def test_adjusted_nodes_carry_nothing_at_rest_and_all_at_once(unit):
     """Against the tube that pin and hub are together; without it the chords' sag presses."""
     sag = FIT * (1.0 - np.cos(np.pi / 64.0)) * unit

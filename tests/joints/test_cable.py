@@ -109,7 +109,8 @@ def test_a_slack_cable_stops_a_weight_as_a_limit_does(rule):
 
 
 @pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast("energy-momentum", "generalized-alpha")
+@pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_weight_vibrates_at_an_elastic_cable(rule):
     """omega^2 = EA/(L m) about its rest, to the second order; taut all the time."""
     load, cable, system = hung(axial_stiffness=2e3)
@@ -127,6 +128,7 @@ def test_a_weight_vibrates_at_an_elastic_cable(rule):
 
 @rules
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_an_elastic_cable_that_goes_slack_keeps_the_energy(rule):
     """A weight that is thrown up leaves it, and comes back with the speed that it had."""
     load, cable, system = hung(axial_stiffness=2e3, length=1.9)

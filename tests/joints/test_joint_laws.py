@@ -154,6 +154,7 @@ def test_a_slider_with_friction_and_an_end(rule):
 
 @pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
 @pytest.mark.fast("generalized-alpha")
+@pytest.mark.fast_on_ranks()
 def test_a_controller_holds_an_angle(rule):
     """T = -k (a - a_0) - d da/dt rests where k (a - a_0) is the moment of the weight."""
     stiff, damping, wanted = 50.0, 10.0, 0.3
@@ -214,6 +215,7 @@ def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
 @rules
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
 @pytest.mark.fast("1.0-energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
     """A pendulum on a ball joint with a damper comes to rest 0.4 rad below the horizontal."""
     body = nts.RigidBody.from_inertia(
@@ -236,6 +238,7 @@ def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
 
 @pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_actuators_make_an_oscillator(rule):
     """T = -k a about an axis, F = -k (l - l_0) along a line: half a period, by the second order."""
     stiff, start = 0.2, 0.5
