@@ -8,7 +8,7 @@ export PYTEST_ARGS RUNS
 
 help:
 	@echo 'make setup          what the others do first: packages of Debian, .venv'
-	@echo 'make test           lint, the fast tests in serial, some cases of the parallel ones on 2 ranks'
+	@echo 'make test           lint, the fast tests in serial, a case of each parallel one on 2 ranks'
 	@echo 'make test-all       what make test leaves out: the tests marked slow, likewise'
 	@echo '                    (.venv/bin/python -m pytest runs both in serial; -m "not slow" the fast)'
 	@echo 'make demo           demos/$(DEMO).py on 2 ranks, output in out/$(DEMO) (DEMO=name for another)'

@@ -43,5 +43,4 @@ if ! [ -f "$venv/.made-for" ] || [ "$(cat "$venv/.made-for")" != "$wanted" ]; th
     --editable "$REPO[wheels,gmsh,tests]"
   printf '%s' "$wanted" >"$venv/.made-for"
 fi
-export PYTEST_ARGS="--cases-on-ranks=1 ${PYTEST_ARGS:-}"
 NO_LINT=1 exec "$REPO/scripts/test.sh"

@@ -37,15 +37,13 @@ if threading.current_thread() is not threading.main_thread():
     # A busy machine may make a process of xdist run its tests beside its main thread. Gmsh 4.8,
     # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
-#: On several ranks so many cases of a fast test run at most, and one of a slow one, spread over its
-#: parameters, and others in the next week. All of them run in serial, and what ranks do seldom
-#: depends on the case.
-CASES_ON_RANKS = 3
 #: Files whose slow tests take longer than others of their size.
 LONG = {
     "test_stability", "test_docs", "test_demo_output", "test_unwritten", "test_massless",
     "test_demo_blocks", "test_demo_stability", "test_conformance", "test_impacts", "test_tradeoff",
 }  # fmt: skip
+#: On several ranks one fast and one slow case of a test run, others in the next week. In serial all
+#: of them run, and what ranks do seldom depends on the case.
 WEEK = datetime.date.today().isocalendar().week
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
@@ -83,7 +81,6 @@ def pytest_addoption(parser):
     group = parser.getgroup("noise", "rounding as on another machine, see tests/noise.py")
     group.addoption("--noise", choices=noise.KINDS, help="what is noisy")
     group.addoption("--noise-seed", type=int, default=0, help="another seed, another machine")
-    parser.addoption("--cases-on-ranks", type=int, default=CASES_ON_RANKS, help="of a fast test")
 
 
 def pytest_report_header(config):
@@ -156,18 +153,14 @@ def pytest_collection_modifyitems(config, items):
 
 
 def _drop_cases(config, items) -> None:
-    """Leave out cases of a test beyond `--cases-on-ranks` of the fast ones and one of the slow."""
+    """Leave out all cases of a test but one of the fast and one of the slow."""
     cases: dict[tuple[str, bool], list] = {}
     for item in items:
         slow = item.get_closest_marker("slow") is not None
         cases.setdefault((item.nodeid.split("[")[0], slow), []).append(item)
-    dropped = set()
-    for (_, slow), of_test in cases.items():
-        apart = -(-len(of_test) // (1 if slow else config.option.cases_on_ranks))
-        kept = of_test[WEEK % apart :: apart]
-        dropped.update(item for item in of_test if item not in kept)
-    items[:] = [item for item in items if item not in dropped]
-    config.hook.pytest_deselected(items=list(dropped))
+    kept = {of_test[WEEK % len(of_test)] for of_test in cases.values()}
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = [item for item in items if item in kept]
 
 
 def pytest_collection_finish(session):

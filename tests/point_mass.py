@@ -8,9 +8,9 @@ from mpi4py import MPI
 
 import dolfinx
 import numpy as np
-from dolfinx.mesh import CellType, GhostMode, create_box
 from petsc4py import PETSc
 from rotations import rotation
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.skins import locate_facets
@@ -100,10 +100,7 @@ def turn(angle=0.7):
 
 def wall(turned=False):
     """One fixed hexahedron; its surface is at z = 0, or turned in space."""
-    mesh = create_box(
-        COMM, [[-1, -1, -1], [1, 1, 0]], [2, 2, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([-1, -1, -1], [1, 1, 0], [2, 2, 1])
     q = turn() if turned else np.eye(3)
     top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     tags = dolfinx.mesh.meshtags(mesh, 2, np.sort(top), np.full(len(top), 1, np.int32))

@@ -100,6 +100,8 @@ def test_tags(part):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast("hexahedron")
+@pytest.mark.fast_on_ranks()
 def test_files_and_pictures(part, mpi_tmp_path):
     """Corners of the cells, with the fields there."""
     body = part.continuum(RUBBER, density=1.0, velocity=lambda x: np.stack([x[1], x[2], x[0]]))
@@ -139,6 +141,7 @@ def test_folded_cells(part):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_body_that_flies_keeps_what_it_has(part):
     """Energy and momenta of a curved body that spins."""
     body = part.continuum(

@@ -74,6 +74,7 @@ def test_a_step_that_turns_an_element_by_90_degrees_is_not_accepted():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.fast_on_ranks()
 def test_how_soft_an_element_is(degree):
     """The moment, by differences of the energy, is that which the message says is missing."""
     system = turned(88.0, degree=degree)
@@ -102,6 +103,7 @@ def test_an_arc_of_too_few_beams_is_told(cells, missing):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_strip_of_too_few_beams_is_told():
     """An element bears EI / (2 length) at most, at a turn of 45 degrees."""
     load = nts.PointMoment(tip, (0, 0, 2 * np.pi * 2))

@@ -7,11 +7,11 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import two_blocks
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
 from integrators import MID_STEP
 from measures import OPEN, PROMISED, ledger_or_word
 from point_mass import PointMass
-from scenes import RUBBER, green, saint_venant
+from scenes import RUBBER, box, green, saint_venant
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -26,16 +26,13 @@ SENTENCE = "inside out, which W(C) cannot see: det F = "
 
 
 def cube(n=2, size=(1.0, 1.0, 1.0), comm=COMM, cell=CellType.hexahedron, **options):
-    mesh = create_box(comm, [[0, 0, 0], size], [n] * 3, cell, ghost_mode=GhostMode.shared_facet)
+    mesh = box([0, 0, 0], size, n, cell, comm=comm)
     return nts.Continuum(mesh, RUBBER, density=1e3, **({"name": "cube"} | options))
 
 
 def form_cube(n=2, **options):
     """A cube of forms of a user's own."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 1]], [n] * 3, CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(cells=n)
     space = compat.vector_space(mesh, 1)
     return nts.FormBody(
         space, saint_venant(2e5, 0.3), strain=green, density=1e3, name="cube", **options
@@ -192,6 +189,7 @@ SCENES = {
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.fast("1e6 g-balanced")
+@pytest.mark.fast_on_ranks()
 def test_no_step_ends_inside_out(name, accuracy, evaluations):
     """The run stops with a sentence, soon, and what it has accepted is not inside out."""
     system, integrator, dt, t_end = SCENES[name]()
@@ -248,7 +246,7 @@ def test_a_hard_impact_is_whole_or_named(name, accuracy):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_step_too_long_is_cut_back():
     """In one step the upper face passes the cube's middle, which short ones move in time."""
     runs = [
@@ -283,6 +281,7 @@ def test_on_request_it_goes_on_and_says_so(mpi_tmp_path):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("allowed", [False, True])
+@pytest.mark.fast_on_ranks()
 def test_statics(allowed):
     """A press beyond what the corners bear."""
     system = squeezed(0.9, 3, allow_inversion=allowed)
@@ -322,6 +321,8 @@ def test_contact_is_named_before_the_cell_that_it_crushes(pressed):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("held", [True, False], ids=["held", "on a plane"])
+@pytest.mark.fast("held")
+@pytest.mark.fast_on_ranks()
 def test_a_load_step_that_ends_nearly_inside_out_says_so(held, monkeypatch):
     """Newton's method ends there, or the relaxations; under 1 g, nothing is near it."""
     monkeypatch.setattr("dolfinx_nts.run.load_steps._RELAXATIONS", 10)

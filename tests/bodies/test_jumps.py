@@ -35,6 +35,8 @@ def scene(value, metre=1.0, where=None, **options):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", [1.0, 1e3])
+@pytest.mark.fast("1000.0")
+@pytest.mark.fast_on_ranks()
 def test_a_step_that_fails_with_a_jump_says_so(metre):
     """An upper half of cells of 0.5 is pushed in by 0.7: no step divides it."""
     for run in (

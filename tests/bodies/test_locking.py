@@ -4,8 +4,9 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from rotations import rotation
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -15,7 +16,7 @@ COMM = MPI.COMM_WORLD
 def bar(cells, poisson, *, height=1.0, kind=CellType.hexahedron, **options):
     """A bar of length 10 and width 1 that a small load bends, and its equilibrium."""
     ends = ((0.0, 0.0, 0.0), (10.0, 1.0, height))
-    mesh = create_box(COMM, ends, cells, kind, ghost_mode=GhostMode.shared_facet)
+    mesh = box(*ends, cells, kind)
     body = nts.Continuum(
         mesh, nts.NeoHookean(young=1.0, poisson=poisson), density=1.0,
         bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
@@ -53,6 +54,7 @@ def test_tetrahedra_are_told_of():
     assert "degree=2" in run.warnings["locking"].text and body.name in run.warnings["locking"].about
 
 
+@pytest.mark.slow
 def test_a_wave_is_no_locking():
     """Stress jumps at the front of a wave in the first steps, and little once it has spread."""
     ends = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
@@ -76,6 +78,7 @@ def test_a_wave_is_no_locking():
     s.close()
 
 
+@pytest.mark.slow
 def test_what_a_run_says_is_of_all_its_steps(tmp_path):
     """It goes on from one that ended in the midst of waves, and says what an unbroken run does."""
     mesh = create_box(COMM, ((0.0, 0.0, 0.0), (8.0, 1.0, 1.0)), (16, 2, 2), CellType.hexahedron)

@@ -213,6 +213,7 @@ def check_kept(table, integrator):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_without_such_nodes_there_is_no_massless_defect():
     """Not even of the rounding of nodes that leave, which a summary would tell."""
     left = nts.Continuum(box(cells=2), RUBBER, density=1e3, velocity=(2, 0, 0), name="left")

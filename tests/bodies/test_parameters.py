@@ -159,6 +159,7 @@ def test_a_modulus_changed_between_steps(kind):
 @pytest.mark.fast("constant-integrator0")
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint(), nts.Newmark()])
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.fast_on_ranks()
 def test_a_density_changed_between_steps(kind, integrator):
     """Mass that comes has the velocity of its place: energy and momentum grow with it."""
     mesh = box(cells=(2, 2, 2))

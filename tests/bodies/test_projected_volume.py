@@ -57,12 +57,19 @@ def bar(cells, poisson, metre=1.0, **options):
         ((20, 2, 2), 0.4999, 94.3), ((20, 1, 1), 0.4999, 136.1), ((20, 2, 2), 0.499999, 94.3),
     ],
 )  # fmt: skip
+@pytest.mark.fast(
+    "cells1-0.3-116.1",
+    "cells3-0.4999-94.3",
+    "cells4-0.4999-136.1",
+    "cells5-0.499999-94.3",
+)
 def test_bars_bend_as_in_another_program(cells, poisson, share):
     """Theory 19.5, per cent of the reference."""
     assert 100.0 * bar(cells, poisson) / DEFLECTION[poisson] == pytest.approx(share, abs=0.1)
 
 
 @pytest.mark.parametrize("metre", [1e-3, 1e3])
+@pytest.mark.fast("1000.0")
 def test_units_of_a_bar(metre):
     assert bar((10, 1, 1), 0.4999, metre) == pytest.approx(bar((10, 1, 1), 0.4999), rel=1e-9)
 
@@ -136,6 +143,7 @@ def test_forces_are_the_slope_of_the_energy(name):
 
 
 @pytest.mark.parametrize("name", OF)
+@pytest.mark.fast("own")
 def test_work_is_the_change_of_the_energy(name):
     body = body_of(distorted(), OF[name])
     u0, u1 = between(body)
@@ -154,6 +162,7 @@ def test_small_motions_keep_their_digits():
 
 
 @pytest.mark.parametrize("rule", [*MID_STEP.values(), EQUILIBRIUM], ids=[*MID_STEP, "static"])
+@pytest.mark.fast("energy-momentum", "static")
 def test_tangent(rule):
     """With some coordinates prescribed, whose rows and columns hold the diagonal alone."""
     body = body_of(distorted(), bcs=[nts.Dirichlet(lambda x: x[0] < 0.3, components=[1])])

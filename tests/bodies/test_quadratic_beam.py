@@ -76,6 +76,7 @@ def test_the_cantilever_of_reissners_equations(curved):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_bend_of_bathe_and_bolourchi():
     """On a curved mesh; elements of two nodes tend to the same, with order 2 (B27')."""
     section = nts.Section(EA=1e7, GA=(5e6,) * 2, GJ=1e7 / 12, EI=(1e7 / 12,) * 2, rhoA=1,
@@ -115,10 +116,10 @@ def test_the_force_in_a_section():
 
 
 # ---- dynamics
-def flying(comm=COMM, n=4):
+def flying(n=4):
     """B29 with as many nodes."""
     return nts.Beam(
-        interval_mesh(straight(n, 10.0), comm=comm), SOFT, degree=2, angular_velocity=(0.3, 0.5, 1),
+        interval_mesh(straight(n, 10.0)), SOFT, degree=2, angular_velocity=(0.3, 0.5, 1),
         velocity=lambda x: np.array([0, 0, 0.5])[:, None] * np.cos(np.pi * x[0] / 10),
     )  # fmt: skip
 
@@ -155,26 +156,6 @@ def test_flying_spaghetti(n):
     assert run.status == "completed" and not run.warnings
     off = beam.centreline()[1][0] - (8.1784, 2.0560, 0.0)
     assert np.linalg.norm(off) < 0.1
-
-
-@pytest.mark.mpi
-def test_ranks_give_the_motion_of_one():
-    several, alone = flying(), flying(MPI.COMM_SELF)
-    for body in (several, alone):
-        nts.simulate(nts.System([body]), EM, dt=0.1, t_end=0.5)
-    x, y = several.centreline()[1], alone.centreline()[1]
-    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
-
-
-@pytest.mark.mpi
-def test_a_run_goes_on_from_a_checkpoint(tmp_path):
-    path = COMM.bcast(tmp_path) / "beam.h5"
-    whole, first, second = (nts.System([flying()]) for _ in range(3))
-    nts.simulate(whole, EM, dt=0.05, t_end=0.4)
-    nts.simulate(first, EM, dt=0.05, t_end=0.2, checkpoint=nts.Checkpoint(path, every=4))
-    nts.simulate(second, EM, dt=0.05, t_end=0.4, start=nts.restart(path, second))
-    places = [system.bodies[0].centreline()[1] for system in (whole, second)]
-    assert places[1] == pytest.approx(places[0], abs=1e-11)
 
 
 @pytest.mark.mpi

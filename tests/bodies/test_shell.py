@@ -151,6 +151,7 @@ def moved(body):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_cantilever_of_sze():
     force = nts.LineForce((0, 0, 4), where=at(0, 10.0))
     body = strip(16, forces=[force])

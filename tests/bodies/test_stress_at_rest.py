@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -21,9 +21,7 @@ pytestmark = pytest.mark.mpi
 def block(part, name="block", **options):
     """A cube of NeoHookean with a stress of this part of the shear modulus, alike everywhere."""
     low, high = np.array([[0, 0, 0], [1, 1, 1]]) + [5.0, -3.0, 2.0]
-    mesh = create_box(
-        COMM, [low, high], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
-    )
+    mesh = box(low, high, 2)
     rubber = nts.NeoHookean(young=1e6, poisson=0.3)
     # A Constant, so that all parts share one compiled form.
     stress = fem.Constant(mesh, part * SHEAR)

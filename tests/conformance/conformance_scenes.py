@@ -205,7 +205,7 @@ def more_joints(frame):
 
 
 def sewn(frame):
-    """Two shells that meet at right angles in a seam, one of them clamped."""
+    """Two shells that meet at 68 degrees in a seam, one of them clamped."""
     given = {
         "young": frame.size(1e7, 2), "poisson": 0.3, "thickness": frame.size(0.03, 1),
         "density": DENSITY,
@@ -214,6 +214,8 @@ def sewn(frame):
     mesh = frame.grid("quadrilateral", (0, 0, 0), (1, 0.5, 0), (4, 2))
     flange = nts.Shell(mesh, bcs=[clamp], name="flange", **given)
     mesh = frame.grid("quadrilateral", (0, 0, 0.5), (0.5, 0.4, 0.5), (2, 2), axes=(1, 2, 0))
+    x, y, z = frame.back(mesh.geometry.x).T
+    mesh.geometry.x[:] = frame.place(np.column_stack([x + 0.4 * z, y, z]))
     web = nts.Shell(mesh, name="web", **given)
     edge = web.surface(frame.where(lambda x: x[:, 2] < 1e-6), side="edge")
     return nts.System([flange, web], joints=[nts.Seam(flange, edge)], gravity=_gravity(frame))
@@ -291,9 +293,94 @@ def hoist(frame):
     return nts.System([jib, load], joints=joints, gravity=_gravity(frame))
 
 
+def of_degree_two(frame):
+    """Hexahedra between tetrahedra of degree 2: contact over surfaces, and of nodes with edges."""
+    middle = _solid(frame, "hexahedron", (0, 0, 0), (1, 1, 0.5), (2, 2, 1), "middle")
+    below, above = (
+        _solid(
+            frame, "tetrahedron", (0.11, 0.17, z), (0.83, 0.77, z + 0.4), (1, 1, 1), name, degree=2,
+            velocity=frame.place(0.4, 0.2, speed),
+        )
+        for name, z, speed in (("below", -0.403, 0.9), ("above", 0.502, -0.9))
+    )  # fmt: skip
+    surfaces = nts.ContactPair(
+        _face(frame, above, 2, 0.502), _face(frame, middle, 2, 0.5), friction=0.3,
+        integration="surface",
+    )  # fmt: skip
+    nodes = nts.ContactPair(
+        _face(frame, below, 2, -0.003), _face(frame, middle, 2, 0.0), friction=0.3
+    )
+    return nts.System([below, middle, above], contacts=[surfaces, nodes])
+
+
+def beam_on_a_plate(frame):
+    """A beam of degree 2 that slides on a shell."""
+    bar = _beam(
+        frame, (0.13, 0.21, 0.0551), (0.83, 0.77, 0.0561), 2, degree=2, name="bar",
+        velocity=frame.place(0.3, 0, -0.1),
+    )  # fmt: skip
+    mesh = frame.grid("quadrilateral", (0, 0, 0), (1, 1, 0), (4, 4))
+    plate = nts.Shell(
+        mesh, young=frame.size(1e7, 2), poisson=0.3, thickness=frame.size(0.03, 1),
+        density=DENSITY, name="plate",
+    )  # fmt: skip
+    pair = nts.ContactPair(bar.surface(), plate.surface(side="top"), friction=0.3)
+    return nts.System([bar, plate], contacts=[pair])
+
+
+def over_waves(frame):
+    """A block that touches smooth waves across a gap that counts as none, and slides on them."""
+    mesh = frame.grid("hexahedron", (0, 0, -0.3), (1.2, 1, 0), (6, 5, 1))
+    x, y, z = frame.back(mesh.geometry.x).T
+    z = z + 0.03 * np.sin(6 * x) * np.cos(4 * y) * (1 + z / 0.3)
+    mesh.geometry.x[:] = frame.place(np.column_stack([x, y, z]))
+    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    plate = nts.Continuum(mesh, law, density=DENSITY, name="plate")
+    block = _solid(
+        frame, "hexahedron", (0.21, 0.23, 0.025), (0.61, 0.63, 0.3), (2, 2, 1), "block",
+        velocity=frame.place(1.0, 0.7, -0.5),
+    )  # fmt: skip
+    waves = plate.surface(frame.where(lambda x: x[:, 2] > -0.1), smoothing=True)
+    pair = nts.ContactPair(
+        _face(frame, block, 2, 0.025), waves, friction=0.3, adjust=frame.size(0.012, 1)
+    )
+    return nts.System([block, plate], contacts=[pair])
+
+
+def laws_in_joints(frame):
+    """A hinge with friction, one with limits, and weights at a cable that rubs on its pins."""
+    arms = [
+        _rigid(frame, (k, -0.1, -0.1), (k + 1, 0.1, 0.1), f"arm {k}", cells=(1, 1, 1))
+        for k in range(2)
+    ]
+    axis = frame.axis(0, 1, 0)
+    joints = [
+        nts.Revolute(
+            arms[0], None, point=frame.place(0, 0, 0), axis=axis, name="hinge",
+            friction=nts.JointFriction(bound=frame.size(30.0, 5)),
+        ),
+        nts.Revolute(
+            arms[1], arms[0], point=frame.place(1, 0, 0), axis=axis, name="elbow",
+            limits=(-0.005, 0.005),
+        ),
+    ]  # fmt: skip
+    weights = [
+        _rigid(frame, (x, 1, -1), (x + 0.2, 1.2, -0.8), f"weight at {x}", cells=(1, 1, n))
+        for x, n in ((0, 1), (1, 2))
+    ]
+    way = [(weights[0], (0.1, 1.1, -0.8)), (None, (0.1, 1.1, 0)), (None, (1.1, 1.1, 0)),
+           (weights[1], (1.1, 1.1, -0.8))]  # fmt: skip
+    cable = nts.Cable(
+        [(body, frame.place(*x)) for body, x in way], friction=0.05, name="cable",
+        length=lambda t: frame.size(2.6 - 0.3 * t, 1),
+    )  # fmt: skip
+    return nts.System([*arms, *weights], joints=[*joints, cable], gravity=_gravity(frame))
+
+
 #: Step [s] of each scene.
 SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
     beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
-    fold: 2e-3, hoist: 5e-3,
+    fold: 2e-3, hoist: 5e-3, of_degree_two: 2e-3, beam_on_a_plate: 1e-3, over_waves: 2e-3,
+    laws_in_joints: 1e-2,
 }  # fmt: skip

@@ -7,7 +7,16 @@ from mpi4py import MPI
 import noise
 import numpy as np
 import pytest
-from conformance_scenes import SCENES, mechanism, tied, two_blocks
+from conformance_scenes import (
+    SCENES,
+    beam_on_a_plate,
+    fold,
+    mechanism,
+    of_degree_two,
+    over_waves,
+    tied,
+    two_blocks,
+)
 from frames import Frame
 from integrators import INTEGRATORS, MID_STEP
 from rotations import rotation
@@ -18,10 +27,10 @@ COMM = MPI.COMM_WORLD
 STEPS = 12
 RULE = nts.EnergyMomentum()
 TURN = rotation(1.1, (1, 2, -0.5))
-#: Frames that must not matter.
+#: Frames that must not matter: numbers much larger and much smaller, turned, in another order.
 FRAMES = {
-    "millimetres": Frame(unit=1e3), "micrometres": Frame(unit=1e-6), "turned": Frame(turn=TURN),
-    "renumbered": Frame(shuffle=3),
+    "millimetres": Frame(unit=1e3, turn=TURN, shuffle=3),
+    "micrometres": Frame(unit=1e-6, turn=TURN.T, shuffle=4),
 }  # fmt: skip
 #: Part of the scene's size by which places may differ: the solver's tolerance, and what contacts
 #: make of it in so few steps.
@@ -31,6 +40,8 @@ PAUSED = [
     (scene, name) for scene in SCENES for name in INTEGRATORS
     if name == "energy-momentum" or scene in (mechanism, two_blocks)
 ]  # fmt: skip
+#: Scenes of bodies that nothing holds or drives.
+FREE = (two_blocks, tied, fold, of_degree_two, beam_on_a_plate, over_waves)
 scenes = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
 
 
@@ -93,17 +104,18 @@ def test_each_body_coupling_and_law_of_the_package_has_a_scene():
 @pytest.mark.mpi
 @scenes
 def test_the_ledger_closes(scene):
-    """And in each scene something is moved, stored, or pressed."""
+    """And in each scene something moves, is stored, or is pressed, slips and stays outside."""
     _, table = plain(scene)
     top = max(np.abs(table[name]).max() for name in ("kinetic", "potential", "external_work"))
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * top
     assert np.all(np.diff(table["friction_dissipation"]) >= -1e-12 * top)
-    assert table["active"].any() == bool(scene(Frame()).contacts)
+    if scene(Frame()).contacts:
+        assert table["min_gap"].min() > -1e-12 and table["slip"].any()
 
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", MID_STEP)
-@pytest.mark.parametrize("scene", [two_blocks, tied], ids=["two_blocks", "tied"])
+@pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.__name__)
 def test_free_bodies_keep_their_momenta(scene, name):
     _, table = plain(scene, name)
     for column in ("linear_momentum", "angular_momentum"):
@@ -122,7 +134,7 @@ def test_no_frame_matters(scene, frame):
     assert np.allclose(table["energy"] / frame.unit**5, before["energy"], rtol=0, atol=1e-7 * top)
 
 
-@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize("name", sorted(INTEGRATORS.keys() - {"energy-momentum"}))
 @scenes
 @pytest.mark.slow
 def test_no_frame_matters_to_any_integrator(scene, name):
@@ -161,8 +173,11 @@ def test_a_run_goes_on_where_a_checkpoint_was_written(scene, name, tmp_path):
 
 @scenes
 def test_no_rounding_matters(scene, monkeypatch):
+    expected, _ = plain(scene)
     noise.install("both", 1, monkeypatch.setattr)
-    assert_alike(run_of(scene, Frame())[0], plain.__wrapped__(scene)[0])
+    found, _ = run_of(scene, Frame())
+    assert (found != expected).any()
+    assert_alike(found, expected)
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)

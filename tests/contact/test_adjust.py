@@ -45,6 +45,7 @@ def block_on(kind, unit=1.0, sign=1.0, **options):
 
 @pytest.mark.parametrize("kind", ["plate", "plane"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.fast("1.0-plane", "-1.0-plane")
 def test_a_block_beside_a_plate_rests_on_it_at_once(kind, sign):
     for unit in (1.0, UNITS[0]):
         system = block_on(kind, unit, sign, friction=0.3, adjust=1.001 * GAP * unit)
@@ -75,6 +76,8 @@ def rubbing(adjust):
 
 
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.fast("integrator0")
+@pytest.mark.fast_on_ranks()
 def test_bodies_that_touch_across_a_gap_keep_momenta_and_energy(integrator):
     run = nts.simulate(rubbing(0.0501), integrator, dt=2e-3, t_end=0.06)
     assert run.status == "completed"
@@ -92,17 +95,10 @@ def test_bodies_that_touch_across_a_gap_keep_momenta_and_energy(integrator):
     assert not far.balance["active"].any()
 
 
-def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
-    whole = nts.simulate(rubbing(0.0501), nts.EnergyMomentum(), dt=2e-3, t_end=0.04)
+def test_a_checkpoint_of_another_gap_is_refused(mpi_tmp_path):
     path = mpi_tmp_path / "run.h5"
-    saves = nts.Checkpoint(path, every=10)
-    nts.simulate(rubbing(0.0501), nts.EnergyMomentum(), dt=2e-3, t_end=0.02, checkpoint=saves)
-    system = rubbing(0.0501)
-    start = nts.restart(path, system)
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.04, start=start)
-    for name in ("energy", "friction_dissipation", "contact_defect"):
-        found, wanted = (r.balance[name][-1] for r in (run, whole))
-        assert found == pytest.approx(wanted, rel=1e-9), name
+    saves = nts.Checkpoint(path, every=1)
+    nts.simulate(rubbing(0.0501), nts.EnergyMomentum(), dt=2e-3, t_end=2e-3, checkpoint=saves)
     with pytest.raises(ValueError, match="adjust"):
         nts.restart(path, rubbing(0.0502))
 

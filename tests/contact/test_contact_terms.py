@@ -32,6 +32,7 @@ def block_and_terms(comm, friction=0.0):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_friction_is_that_of_equilibrium():
     """Its history goes on from step to step: sticking nodes drag the block, slipping ones less."""
     block, contact = block_and_terms(COMM, friction=0.4)

@@ -72,6 +72,7 @@ def test_what_passes_an_edge_closely_is_not_held_by_the_plane_beyond_it(rule, sl
 
 @pytest.mark.parametrize("passes", [6, pytest.param(60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("slope", [3.0, 1.0, 0.0, -0.3])
+@pytest.mark.fast("0.0-6")
 def test_what_hits_the_top_is_held_and_what_passes_beside_it_is_not(slope, passes):
     """At edges by which faces turn by 34 to 99 degrees, as a corner's straight way meets the top.
 

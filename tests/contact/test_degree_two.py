@@ -19,23 +19,21 @@ HEX, TET = CELLS["hexahedron"], CELLS["tetrahedron"]
 
 # ---- thrown blocks
 def thrown(
-    cells=(HEX, HEX), degrees=(2, 2), friction=0.3, metre=1.0, comm=COMM, rigid=False,
-    **options,
+    cells=(HEX, HEX), degrees=(2, 2), friction=0.3, comm=COMM, rigid=False, **options
 ):  # fmt: skip
     """A block that flies askew into a larger one."""
-    bodies, material = [], nts.NeoHookean(1e6 / metre, 0.3)
+    bodies = []
     boxes = (([0, 0, 0], [1, 1, 1]), ([1.02, -0.13, -0.17], [2.02, 1.07, 1.03]))
     for (low, high), cell, degree, n in zip(boxes, cells, degrees, (1, 2), strict=True):
-        mesh = box(metre * np.array(low), metre * np.array(high), n, cell, comm)
-        given = {"density": 1e3 / metre**3, "name": f"block {len(bodies)}"}
+        mesh = box(low, high, n, cell, comm)
+        given = {"density": 1e3, "name": f"block {len(bodies)}"}
         if not bodies:
-            given["velocity"] = (2 * metre, 0.7 * metre, 0.2 * metre)
+            given["velocity"] = (2, 0.7, 0.2)
         if rigid and bodies:
             bodies.append(nts.RigidBody(mesh, **given))
         else:
-            bodies.append(nts.Continuum(mesh, material, degree=degree, **given))
-    slave = bodies[0].surface(at(0, metre, metre))
-    master = bodies[1].surface(at(0, 1.02 * metre, metre))
+            bodies.append(nts.Continuum(mesh, RUBBER, degree=degree, **given))
+    slave, master = (body.surface(at(0, x)) for body, x in zip(bodies, (1.0, 1.02), strict=True))
     pair = nts.ContactPair(slave, master, friction=friction, **options)
     return nts.System(bodies, contacts=[pair])
 
@@ -55,15 +53,21 @@ def assert_kept(run, energy=True):
         assert change < 1e-12 * np.abs(table[name]).max()
 
 
+#: Cells and degrees of both sides, each by each integration, and each of these by both frictions.
+PAIRS = {
+    "27": ((HEX, HEX), (2, 2), "nodes", 0.0), "27-sum": ((HEX, HEX), (2, 2), "surface", 0.3),
+    "10": ((TET, TET), (2, 2), "nodes", 0.3), "10-sum": ((TET, TET), (2, 2), "surface", 0.0),
+    "10-8": ((TET, HEX), (2, 1), "nodes", 0.0), "10-8-sum": ((TET, HEX), (2, 1), "surface", 0.3),
+    "8-10": ((HEX, TET), (1, 2), "nodes", 0.3), "8-10-sum": ((HEX, TET), (1, 2), "surface", 0.0),
+}  # fmt: skip
+
+
 @pytest.mark.mpi
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integration", ["nodes", "surface"])
 @pytest.mark.parametrize(
-    ("cells", "degrees"),
-    [((HEX, HEX), (2, 2)), ((TET, TET), (2, 2)), ((TET, HEX), (2, 1)), ((HEX, TET), (1, 2))],
-    ids=["27", "10", "10-8", "8-10"],
+    ("cells", "degrees", "integration", "friction"), PAIRS.values(), ids=PAIRS
 )
-@pytest.mark.fast_on_ranks("27-surface-0.3", "10-nodes-0.3", "8-10-nodes-0.0")
+@pytest.mark.fast("27-sum", "10", "8-10")
+@pytest.mark.fast_on_ranks("27-sum", "10", "8-10")
 def test_energy_and_momenta(cells, degrees, integration, friction):
     run = fly(thrown(cells, degrees, friction, integration=integration))
     assert_kept(run)
@@ -73,6 +77,7 @@ def test_energy_and_momenta(cells, degrees, integration, friction):
 
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
 @pytest.mark.parametrize("rule", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-10")
 def test_integrators(rule, cell):
     run = fly(thrown((cell, cell)), rule)
     if rule in CONTACT_RULES:
@@ -82,29 +87,13 @@ def test_integrators(rule, cell):
 
 
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
+@pytest.mark.fast("27")
 def test_a_rigid_master(cell):
     assert_kept(fly(thrown((cell, cell), rigid=True)))
 
 
-@pytest.mark.parametrize("metre", UNITS)
-def test_units(metre):
-    one, other = (fly(thrown((TET, HEX), metre=m), t_end=0.03).balance for m in (1.0, metre))
-    assert other["energy"] == pytest.approx(one["energy"] * metre**2, rel=1e-12)
-    assert np.array_equal(one["active"], other["active"])
-
-
 @pytest.mark.mpi
-@pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-@pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
-def test_ranks(cell):
-    runs = [fly(thrown((cell, cell), comm=comm), t_end=0.03) for comm in (COMM, MPI.COMM_SELF)]
-    assert runs[0].balance["active"].max() >= 4
-    assert difference(*(run.balance for run in runs)) < 1e-10
-    force = [run.contact_forces for run in runs]
-    assert np.abs(force[0] - force[1]).max() < 1e-8 * np.abs(force[1]).max()
-
-
-@pytest.mark.mpi
+@pytest.mark.slow
 def test_a_restarted_run_is_the_uninterrupted_one(mpi_tmp_path):
     """On the same ranks, and on each alone."""
     path = mpi_tmp_path / "run.h5"
@@ -198,6 +187,16 @@ def stacked(cells, cell, degrees, integration):
 @pytest.mark.parametrize("cells", [(3, 2), (2, 3)], ids=str)
 @pytest.mark.parametrize("degrees", [(2, 2), (2, 1), (1, 2)], ids=str)
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
+@pytest.mark.fast(
+    "27-(2, 1)-(3, 2)",
+    "27-(2, 1)-(2, 3)",
+    "27-(1, 2)-(3, 2)",
+    "27-(1, 2)-(2, 3)",
+    "10-(2, 1)-(3, 2)",
+    "10-(2, 1)-(2, 3)",
+    "10-(1, 2)-(3, 2)",
+    "10-(1, 2)-(2, 3)",
+)
 def test_uniform_pressure_between_any_meshes(cell, degrees, cells):
     """Integrated over the slave's faces, with hats on its facets (theory 17.3)."""
     pressure, off = stacked(cells, cell, degrees, "surface")
@@ -265,6 +264,8 @@ def test_cantilever_on_a_roller(cell, within):
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
 @pytest.mark.parametrize("table", ["plane", "body"])
+@pytest.mark.fast("plane-27")
+@pytest.mark.fast_on_ranks()
 def test_a_sliding_block_decelerates_by_mu_g(cell, table):
     """At rest on its floor, its momentum falls by mu m g in each step."""
     mu, gravity, dt = 0.2, 9.81, 2e-3
@@ -300,6 +301,7 @@ def test_a_sliding_block_decelerates_by_mu_g(cell, table):
 @pytest.mark.parametrize("integration", ["nodes", "surface"])
 @pytest.mark.parametrize("inner", [True, False])
 @pytest.mark.fast_on_ranks("True-surface")
+@pytest.mark.fast("False-nodes", "False-surface")
 def test_press_fit(integration, inner):
     """Lame's pressure between two tubes, 6 and 5 curved cells a quarter, whichever is the slave.
 
@@ -329,6 +331,8 @@ def test_press_fit(integration, inner):
 # ---- edges, corners, itself
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
+@pytest.mark.fast("27")
+@pytest.mark.fast_on_ranks()
 def test_crossed_edges(cell):
     """A cube on an edge falls across the edge of another: the edges alone touch."""
     low = turned(ON_EDGE, np.zeros(3), "low", cells=1, cell=cell, degree=2)
@@ -392,6 +396,8 @@ def test_a_curved_mesh():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["flexible", "rigid"])
+@pytest.mark.fast("rigid")
+@pytest.mark.fast_on_ranks()
 def test_a_curved_mesh_rolls_and_bounces(kind):
     """The curved ring falls on a plane; the nodes of its outer face are the slaves."""
     given = {"density": 1e3, "velocity": (0.5, 0.5, -2.0), "name": "ring"}

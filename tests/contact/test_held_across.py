@@ -85,6 +85,7 @@ def test_dragged_from_stick_to_slip(shape):
 @pytest.mark.mpi
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.fast("shape3")
+@pytest.mark.fast_on_ranks()
 def test_sticking_nodes_feel_nothing_across(shape):
     run = dragged(0.6, shape, 0.002, 2)
     normal, friction, across = forces(run)
@@ -134,6 +135,7 @@ def evaluate(contact, x, multiplier):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.fast("shape0", "shape1", "shape2")
 def test_rows_are_regular_at_the_edge_of_sticking(shape):
     """Nodes that have not slipped yet but are at Coulomb's bound, as at the start of a step."""
     contact, x, multiplier = at_rest(shape)
@@ -151,7 +153,7 @@ def test_rows_are_regular_at_the_edge_of_sticking(shape):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("sliding", [False, True])
-@pytest.mark.fast("False-shape0", "True-shape3")
+@pytest.mark.fast("False-shape0")
 def test_tangent_is_the_derivative_of_the_residual(shape, sliding):
     contact, x, multiplier = at_rest(shape)
     rng = np.random.default_rng(5)

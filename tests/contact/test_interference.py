@@ -78,6 +78,7 @@ def test_cubes_share_their_overlap(overlap, options):
     assert np.abs(table["external_work"]).max() < 1e-12 * stored
 
 
+@pytest.mark.slow
 def test_the_ledger_closes_as_the_square_of_the_load_steps():
     runs = [nts.equilibrium(cubes(0.005), load_steps=n) for n in (1, 2, 4)]
     left = [run.balance["ledger_residual"][-1] for run in runs]
@@ -95,6 +96,7 @@ def test_overlap_goes_in_proportion_to_the_pseudo_time():
         nts.simulate(run.system, nts.EnergyMomentum(), dt=1e-3, t_end=1.0, start=run)
 
 
+@pytest.mark.fast_on_ranks()
 def test_a_dynamic_run_begins_from_the_fit():
     system = cubes(0.005)
     text = r'25 slave nodes .*interference="resolve" is for .*start='
@@ -178,6 +180,7 @@ def lame(interference):
     return interference * YOUNG / ((1.0 - POISSON**2) * FIT * (outer + inner))
 
 
+@pytest.mark.slow
 def test_a_pin_pressed_into_a_hole():
     """The smooth surface is off at the ends of the quarter; the slow test has finer meshes."""
     found = pressed(2e-3, (24, 16), smoothing=True)
@@ -196,6 +199,7 @@ def test_a_pin_pressed_into_a_hole_on_fine_meshes():
     [("surface", False, 0.015), ("surface", True, 0.015), ("nodes", False, 0.2)],
 )
 @pytest.mark.parametrize("around", [(24, 16), (16, 24)])
+@pytest.mark.fast("around0-nodes-False-0.2")
 def test_shells_of_other_meshes_press_as_the_mean_of_their_chords_overlaps(
     around, integration, swap, off
 ):
@@ -211,6 +215,7 @@ def test_shells_of_other_meshes_press_as_the_mean_of_their_chords_overlaps(
     assert found == pytest.approx(lame(1e-2 + 2.0 / 3.0 * (hub - pin)), rel=off)
 
 
+@pytest.mark.slow
 def test_a_fit_without_clearance_is_pressed_by_the_sag_of_its_chords():
     """Every third node of the pin is at a corner of the hole; the others are 8/9 of its chords' sag
     inside, on nodes that do not sink between them. That is told, and smooth surfaces do better."""
@@ -266,6 +271,8 @@ def widened(unit, push, **options):
 
 
 @pytest.mark.parametrize("unit", [1.0, 2.0**-10])
+@pytest.mark.fast("0.0009765625")
+@pytest.mark.fast_on_ranks()
 def test_adjusted_nodes_carry_nothing_at_rest_and_all_at_once(unit):
     """Against the tube that pin and hub are together; without it the chords' sag presses."""
     sag = FIT * (1.0 - np.cos(np.pi / 64.0)) * unit

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from integrators import CONTACT_RULES, MID_STEP
+from pairs import pairs
 from point_mass import MASS, PointMass, PointSurface, Sledge
+from scenes import box
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
@@ -45,9 +47,7 @@ FACETS = {
 def plate(facets="squares", low=(-1.0, -1.0), high=(1.0, 1.0), top=0.0, n=(8, 8), name="plate"):
     """A plate that does not move, and its upper face."""
     cell, shape = FACETS[facets]
-    mesh = create_box(
-        COMM, [[*low, top - 0.2], [*high, top]], [*n, 1], cell, ghost_mode=GhostMode.shared_facet
-    )
+    mesh = box([*low, top - 0.2], [*high, top], [*n, 1], cell)
     x, y, _ = mesh.geometry.x.T
     mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = shape(x, y)
     everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
@@ -128,7 +128,7 @@ def assert_slides_straight(h, velocity, tolerance, mu=MU):
 # ---- over facets
 @pytest.mark.parametrize("facets", FACETS)
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("energy-momentum-quads")
+@pytest.mark.slow
 def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
     """Every facet starts at another corner than its neighbour."""
     body, face = plate(facets)
@@ -141,15 +141,16 @@ def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
 
 
 @pytest.mark.parametrize(
-    ("start", "velocity"),
-    [((-0.9, 0.25), (2.0, 0.0)), ((-0.75, -0.75), (1.5, 1.5)), ((-0.5, 0.75), (1.5, -1.5))],
-    ids=["along edges", "along diagonals and over corners", "over corners"],
+    ("integrator", "facets", "way"),
+    pairs(MID_STEP, ["squares", "diagonals"], ["along edges", "along diagonals", "over corners"]),
 )
-@pytest.mark.parametrize("facets", ["squares", "diagonals"])
-@pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-squares-along edges")
-def test_along_edges_and_over_corners(integrator, facets, start, velocity):
+@pytest.mark.fast("energy-momentum-squares-along diagonals")
+def test_along_edges_and_over_corners(integrator, facets, way):
     """Two to six facets are equally near all the time, or again and again."""
+    start, velocity = {
+        "along edges": ((-0.9, 0.25), (2.0, 0.0)), "along diagonals": ((-0.75, -0.75), (1.5, 1.5)),
+        "over corners": ((-0.5, 0.75), (1.5, -1.5)),
+    }[way]  # fmt: skip
     h = follow(scene((*start, 0.0), (*velocity, 0.0), plate(facets)), integrator, 40)
     assert_slides_straight(h, (*velocity, 0.0), 1e-12)
 
@@ -206,10 +207,7 @@ def test_zero_gap_without_force_is_without_friction(integrator, velocity, fricti
 # ---- a curved surface
 def saddle(height):
     """Facets on z = height x y, which bilinear ones hold exactly."""
-    mesh = create_box(
-        COMM, [[-1, -1, -0.5], [1, 1, 0]], [4, 4, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([-1, -1, -0.5], [1, 1, 0], [4, 4, 1])
     top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     one = np.full(len(top), 1, np.int32)
     tags = meshtags(mesh, 2, np.sort(top), one)
@@ -258,10 +256,7 @@ def test_sliding_over_a_saddle_is_of_second_order(integrator):
 # ---- a block over many facets
 def settled_block(facets, friction):
     """A small block thrown over a long plate that it rests on, and the state it starts from."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [0.1, 0.1, 0.05]], [2, 2, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, 0], [0.1, 0.1, 0.05], [2, 2, 1])
 
     def on_plate(held):
         block = nts.Continuum(
@@ -328,7 +323,7 @@ def assert_coulomb(h, acceleration, mu=MU):
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-squares")
+@pytest.mark.slow
 def test_slides_off_and_lands_on_another_plate(integrator, facets):
     """Two masters, one lower and beside the other: slide, flight, bounces, slide."""
     upper = plate(facets, (-1, -1), (0, 1), 0.0, (4, 8), "upper")
@@ -351,7 +346,7 @@ def test_slides_off_and_lands_on_another_plate(integrator, facets):
 
 @pytest.mark.parametrize("start", [-0.505, -0.5, -0.49])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum--0.5")
+@pytest.mark.slow
 def test_two_masters_side_by_side_are_one(integrator, start):
     """Over their seam the gap is closed twice, and carries once."""
     plates = [plate("squares", (k - 1, -1), (k, 1), n=(4, 8), name=f"plate{k}") for k in (0, 1)]
@@ -375,7 +370,7 @@ class Crane(PointMass):
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-squares")
+@pytest.mark.slow
 def test_leaves_the_surface_beyond_its_rim_and_comes_back(integrator, facets):
     body, face = plate(facets)
     start = (0.3, 0.17, 0.0)
@@ -443,8 +438,8 @@ def test_drawn_along_it_loses_its_motion_across(integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-True", "midpoint-False")
 @pytest.mark.fast_on_ranks("energy-momentum-True")
+@pytest.mark.fast("energy-momentum-True")
 def test_far_away_and_on_ranks_without_facets(integrator, condense):
     """A plate of one cell, which one rank owns, and another that nothing comes near."""
     near = plate(n=(1, 1), name="near")
@@ -472,10 +467,7 @@ def test_far_away_and_on_ranks_without_facets(integrator, condense):
 # ---- Newton's iteration
 def falling_cube(tilt, velocity):
     """A stiff cube whose lower edge touches a plane; velocity: v, and its slopes in z, z, x, y."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [0.2] * 3], [1, 1, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, 0], [0.2] * 3, 1)
     x, y, z = mesh.geometry.x.T
     x, z = np.cos(tilt) * x + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * x
     mesh.geometry.x[:] = np.column_stack([x, y, z + np.sin(tilt) * 0.2])
@@ -500,6 +492,7 @@ def falling_cube(tilt, velocity):
     ],
 )
 @pytest.mark.fast("0.191-velocity0")
+@pytest.mark.fast_on_ranks()
 def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(tilt, velocity):
     """Stuck it would be drawn down, free it would pass the plane, and Newton flips between them."""
     newton = nts.Newton(max_retries=0)

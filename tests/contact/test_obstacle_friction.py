@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL
 from point_mass import MASS, STEP, turn
+from scenes import box
 from scenes_obstacles import (
     ACCELERATION,
     CENTRE,
@@ -232,7 +232,7 @@ def shaken(name, scene=None, metre=1.0, integrator="energy-momentum", bounce=Fal
 
 @pytest.mark.parametrize("bounce", [False, True])
 @pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("plane-True", "cylinder-False")
+@pytest.mark.fast("plane-True")
 def test_ledger(name, bounce):
     _, _, rows = shaken(name, bounce=bounce, newton=TO_ROUNDING)
     top = np.abs(rows["energy"]).max()
@@ -246,18 +246,14 @@ def test_ledger(name, bounce):
 # ---- bodies
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("energy-momentum")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_block_slides_on_a_plane_as_on_a_plate(integrator):
     tables, ends = [], []
     for meshed in (True, False):
         body, face = block(velocity=(1.0, 0.4, -0.5))
         master, bodies = nts.Plane((0, 0, 0), (0, 0, 1)), [body]
         if meshed:
-            mesh = create_box(
-                COMM, [[-1, -1, -1], [2, 2, 0]], [3, 3, 1], CellType.hexahedron,
-                ghost_mode=GhostMode.shared_facet,
-            )  # fmt: skip
+            mesh = box([-1, -1, -1], [2, 2, 0], [3, 3, 1])
             hold = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
             bodies.append(
                 nts.Continuum(

@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from scenes import YOUNG, at, box, everywhere, quarter_cube, rubber_stress
 
 import dolfinx_nts as nts
@@ -33,10 +33,7 @@ def test_a_plane_presses_like_a_prescribed_face():
 
 
 def on_floor(friction, shift):
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 0.5]], [3, 3, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, 0], [1, 1, 0.5], [3, 3, 2])
     top = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, value=lambda t: (shift * t, 0, -0.02 * t))
     body = nts.Continuum(
         mesh, nts.NeoHookean(young=1e5, poisson=0.3), density=1e3, bcs=[top], name="block"
@@ -48,7 +45,7 @@ def on_floor(friction, shift):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("shift", [0.002, 0.1])
-@pytest.mark.fast_on_ranks("0.1")
+@pytest.mark.fast_on_ranks()
 def test_friction_carries_the_shear(shift):
     """Pressed down and dragged: sticking, or the whole face slides at mu times the pressure."""
     mu = 0.3
@@ -163,6 +160,7 @@ def test_a_body_elsewhere_does_not_turn_a_rigid_block(young):
     assert np.abs(block.u.x.array).max(initial=0.0) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_rigid_block_on_a_slope_that_is_too_steep_has_no_equilibrium():
     _, run = on_slope(22, (2, 2, 3), nts.Newton(max_retries=1))
     assert "not solved" in run.status
@@ -214,6 +212,7 @@ def pad_on(floors, friction, steps, stabilization=None):
 
 
 @pytest.mark.parametrize("stabilization", [None, 0.1])
+@pytest.mark.fast("None")
 def test_nodes_that_slide_over_waves_in_few_load_steps(stabilization):
     """An equilibrium is that of the facets where its nodes are, however far they came in a step.
 

@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL, differences
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, wall
+from scenes import box
 from scenes_obstacles import (
     ACCELERATION,
     CENTRE,
@@ -153,7 +153,7 @@ def test_rebound_from_a_plane(integrator, theta):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_plane_is_a_fixed_facet(integrator):
     """Bouncing obliquely under gravity: the same path as on the face of a fixed hexahedron."""
     start, velocity, gravity = np.array([0.3, 0.2, 0.04]), (0.4, -0.7, -SPEED), (0, 1.0, -30.0)
@@ -310,17 +310,13 @@ def test_a_floor_that_flees_does_not_pull():
 # ---- bodies
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("midpoint")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
     gravity, tables, ends = (0.0, 0.0, -9.81), [], []
     for meshed in (True, False):
         body, face = block()
         if meshed:
-            mesh = create_box(
-                COMM, [[-1, -1, -1], [2, 2, 0]], [3, 3, 1], CellType.hexahedron,
-                ghost_mode=GhostMode.shared_facet,
-            )  # fmt: skip
+            mesh = box([-1, -1, -1], [2, 2, 0], [3, 3, 1])
             hold = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
             plate = nts.Continuum(
                 mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1e3, bcs=[hold], name="plate"

@@ -21,6 +21,7 @@ def box(low, size, cells, kind=CellType.hexahedron):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast("midpoint")
 def test_a_cube_flies_below_another_one(integrator):
     """Of the two facets at the upper edge it is the top that keeps the other cube outside."""
     low = nts.Continuum(
@@ -35,6 +36,7 @@ def test_a_cube_flies_below_another_one(integrator):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_block_falls_once_it_has_left_the_table():
     """Its end passes the edge at 0.3 s, later by as much as it has turned about the edge."""
     table = nts.RigidBody(
@@ -58,8 +60,8 @@ def test_a_block_falls_once_it_has_left_the_table():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("number", range(12))
-@pytest.mark.fast("0", "1", "2", "3")
 @pytest.mark.fast_on_ranks("1")
+@pytest.mark.fast("0")
 def test_boxes_that_pass_at_random(number):
     """One flies along a side of the other, 1 to 50 mm away, in steps of up to 0.15 m."""
     rng = np.random.default_rng(number)

@@ -42,6 +42,8 @@ def peg(friction, exchanged):
 @pytest.mark.mpi
 @pytest.mark.parametrize("exchanged", [False, True])
 @pytest.mark.parametrize("part", [0.5, 0.8, 1.2])
+@pytest.mark.fast("0.8-True")
+@pytest.mark.fast_on_ranks()
 def test_a_peg_jams_if_friction_is_above_that_of_the_drawer(part, exchanged):
     """2 mu N L = 2 mu F a > F L: its edges cross the rims at nodes of these, and nowhere else.
 

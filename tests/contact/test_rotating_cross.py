@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import rotating_cross as demo
-from dolfinx.mesh import CellType, GhostMode, create_box
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -46,10 +46,7 @@ def test_midpoint_blows_up_with_large_steps():
 @pytest.mark.mpi
 def test_nearly_rigid_cube_turns_by_two_arctan_a_step():
     comm, omega, dt, steps = MPI.COMM_WORLD, 1.0, 0.1, 100
-    mesh = create_box(
-        comm, [[-1, -1, -1], [1, 1, 1]], [2, 1, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([-1, -1, -1], [1, 1, 1], [2, 1, 1], comm=comm)
     body = nts.Continuum(
         mesh, nts.StVenantKirchhoff(young=1e10, poisson=0.0), density=1.0,
         velocity=lambda x: omega * np.stack([-x[1], x[0], 0 * x[2]]),

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from measures import difference, kinds
-from scenes import UNITS, box, everywhere
+from scenes import box, everywhere
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from shells import grid, surface_mesh
@@ -28,14 +28,13 @@ RUBBER = {"young": 1e6, "poisson": 0.3}
 
 
 # ---- a U of two legs
-def shaped(mesh, s, skew, unit):
+def shaped(mesh, s, skew):
     """Lay a box over a U: s in cells from the upper leg's tip, its y from the inner side.
 
     Args:
         mesh: Of a box.
         s: At its nodes, shape (n,).
         skew: Of the spacing of the lower leg's nodes.
-        unit: Width [m].
     """
     _, across, wide = mesh.geometry.x.T.copy()
     radius, angle = 0.5 * GAP + across, np.pi * np.clip((s - LEG) / BEND, 0.0, 1.0)
@@ -44,51 +43,51 @@ def shaped(mesh, s, skew, unit):
     z = 0.5 + np.interp(s, [LEG, LEG + BEND], [NARROW, 1.0]) * (wide - 0.5)
     bent = (s > LEG) & (s < LEG + BEND)
     x = np.where(bent, -radius * np.sin(angle), LENGTH * along)
-    mesh.geometry.x[:] = unit * np.column_stack([x, radius * np.cos(angle), z])
+    mesh.geometry.x[:] = np.column_stack([x, radius * np.cos(angle), z])
     return mesh
 
 
-def strip(skew=0.0, unit=1.0, width=1, comm=COMM):
+def strip(skew=0.0, width=1):
     """The U as one mesh, the lower leg's nodes spaced otherwise than the upper one's."""
     cells = 2 * LEG + BEND
-    mesh = box((0, 0, 0), (cells, THICK, 1), (cells, 2, width), comm=comm)
-    return shaped(mesh, mesh.geometry.x[:, 0].copy(), skew, unit)
+    mesh = box((0, 0, 0), (cells, THICK, 1), (cells, 2, width))
+    return shaped(mesh, mesh.geometry.x[:, 0].copy(), skew)
 
 
-def legs(skew=0.0, unit=1.0):
+def legs(skew=0.0):
     """Its legs as two meshes of the same nodes."""
     meshes = []
     for start in (0, LEG + BEND):
         mesh = box((start, 0, 0), (start + LEG, THICK, 1), (LEG, 2, 1))
-        meshes.append(shaped(mesh, mesh.geometry.x[:, 0].copy(), skew, unit))
+        meshes.append(shaped(mesh, mesh.geometry.x[:, 0].copy(), skew))
     return meshes
 
 
-def pressed(meshes, contact, unit=1.0, push=0.2, **motion):
+def pressed(meshes, contact, push=0.2, **motion):
     """Legs whose bend is held, or whose ends are; with a push their outer sides close the gap.
 
     Args:
         meshes: One, or those of both legs.
         contact: Of the bodies -> the contact.
-        unit: Width [m].
         push: Of both sides [m] at t = 1; 0: they are free.
         motion: Of the bodies.
     """
-    bcs, bodies = [nts.Dirichlet(lambda x: x[0] < 1e-9 * unit)], []
+    bcs, bodies = [nts.Dirichlet(lambda x: x[0] < 1e-9)], []
     for sign in (1.0, -1.0) if push else ():
         def outer(x, sign=sign):
-            far = sign * x[1] > (0.5 * GAP + THICK - 1e-9) * unit
-            return far & (x[0] > 0.5 * LENGTH * unit)
+            far = sign * x[1] > 0.5 * GAP + THICK - 1e-9
+            return far & (x[0] > 0.5 * LENGTH)
 
         bcs.append(
-            nts.Dirichlet(outer, value=lambda t, sign=sign: (0, -sign * push * unit * t, 0),
+            nts.Dirichlet(outer, value=lambda t, sign=sign: (0, -sign * push * t, 0),
                           components=(1,))
         )  # fmt: skip
     for k, mesh in enumerate(meshes):
-        material = nts.NeoHookean(young=RUBBER["young"] / unit, poisson=RUBBER["poisson"])
         own = bcs if len(meshes) == 1 or not push else [bcs[0], bcs[1 + k]]
         bodies.append(
-            nts.Continuum(mesh, material, density=1e3 / unit**3, bcs=own, name="ab"[k], **motion)
+            nts.Continuum(
+                mesh, nts.NeoHookean(**RUBBER), density=1e3, bcs=own, name="ab"[k], **motion
+            )
         )
     return nts.System(bodies, contacts=[contact(bodies)])
 
@@ -113,6 +112,8 @@ def of_two(where, friction=0.0):
     ("friction", "skew", "where"),
     [(0.0, 0.4, inner), (0.4, 0.0, inner), (0.0, 0.0, everywhere), (0.4, 0.4, everywhere)],
 )
+@pytest.mark.fast("0.0-0.0-everywhere")
+@pytest.mark.fast_on_ranks()
 def test_legs_pressed_together_are_two_bodies(friction, skew, where):
     """Nodes of one leg are held, not those of both: else flat parts would be held twice."""
     one, two = (
@@ -139,6 +140,7 @@ def closing(x):
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.Midpoint()])
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("rule1")
 def test_legs_that_hit_each_other_are_two_bodies(rule):
     one, two = (
         nts.simulate(
@@ -152,60 +154,6 @@ def test_legs_that_hit_each_other_are_two_bodies(rule):
     assert two.balance["active"].max() >= 4 and two.balance["slip"].max() >= 2
     # The bend, which is held, has mass but does not move.
     assert difference(one.balance, two.balance) < 1e-10
-
-
-# ---- a U that flies
-def thrown(unit=1.0, friction=0.4, skew=0.4):
-    """The U, whose legs close while it flies and spins."""
-
-    def velocity(x):
-        x = x / unit
-        v = np.cross([0.3, 0.2, 1.0], x.T).T + np.array([[1.0], [0.5], [-0.2]])
-        v[1] -= 5.0 * np.sign(x[1]) * np.clip(x[0] / LENGTH, 0.0, 1.0)
-        return unit * v
-
-    mesh = strip(skew, unit, width=2)
-    material = nts.NeoHookean(young=RUBBER["young"] / unit, poisson=RUBBER["poisson"])
-    body = nts.Continuum(mesh, material, density=1e3 / unit**3, velocity=velocity, name="strip")
-    contact = nts.SelfContact(body.surface(everywhere), friction=friction)
-    return nts.System([body], contacts=[contact])
-
-
-@pytest.fixture(scope="module")
-def flown():
-    """Its balance by the energy-momentum scheme."""
-    run = nts.simulate(thrown(), nts.EnergyMomentum(), dt=4e-3, t_end=0.1)
-    assert run.status == "completed" and not kinds(run)
-    return run.balance
-
-
-def check_momenta(table):
-    assert table["active"].max() >= 8
-    for name in ("linear_momentum", "angular_momentum"):
-        off = np.abs(table[name] - table[name][0]).max()
-        assert off < 1e-12 * np.abs(table[name][0]).max(), name
-    assert table["min_gap"].min() > -1e-10
-
-
-@pytest.mark.mpi
-def test_a_fold_keeps_momenta_and_the_ledger(flown):
-    check_momenta(flown)
-    energy = flown["energy"][0]
-    assert flown["friction_dissipation"][-1] > 1e-3 * energy
-    assert np.abs(flown["ledger_residual"]).max() < 1e-11 * energy
-
-
-def test_the_midpoint_rule_keeps_momenta():
-    check_momenta(nts.simulate(thrown(), nts.Midpoint(), dt=4e-3, t_end=0.06).balance)
-
-
-def test_units_do_not_matter(flown):
-    unit = 1.0 / UNITS[0]
-    table = nts.simulate(thrown(unit), nts.EnergyMomentum(), dt=4e-3, t_end=0.06).balance
-    assert table["active"][-1] > 0
-    # Masses stay, so energies go with the square of lengths.
-    ratio = table["energy"] / unit**2 / flown["energy"][: len(table["energy"])]
-    assert np.abs(ratio - 1.0).max() < 1e-9
 
 
 # ---- what nothing holds is told
@@ -390,6 +338,7 @@ def candidates(mesh):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_what_lies_beside_a_node_does_not_count():
     """Neither do the other side of a plate, edges and corners, and a fold that is wide."""
     assert candidates(box(cells=4)) == 0

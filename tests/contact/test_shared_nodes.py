@@ -48,6 +48,7 @@ def scene(friction, *, poisson=0.3, push=PUSH, on="plate", velocity=(0.0, 0.0, 0
 
 @pytest.mark.parametrize("on", ["plate", "plane"])
 @pytest.mark.parametrize("friction", [(0.4, 0.4), (0.4, 0.1)])
+@pytest.mark.fast_on_ranks()
 def test_both_together_carry_the_load(friction, on):
     run = nts.equilibrium(scene(friction, on=on))
     assert run.status == "completed"

@@ -6,8 +6,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
-from scenes import RUBBER
+from dolfinx.mesh import CellType, create_box
+from scenes import RUBBER, box
 
 import dolfinx_nts as nts
 from dolfinx_nts.kernels import compiled
@@ -18,10 +18,7 @@ COMM = MPI.COMM_WORLD
 
 def cube(cells, low, name, cell_type=CellType.hexahedron, material=RUBBER, **options):
     """A unit cube above z = low; its lower or upper face is the contact surface."""
-    mesh = create_box(
-        COMM, [[0, 0, low], [1, 1, low + 1]], [cells] * 3, cell_type,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, low], [1, 1, low + 1], cells, cell_type)
     return nts.Continuum(mesh, material, density=1e3, name=name, **options)
 
 

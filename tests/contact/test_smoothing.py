@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from point_mass import PointSurface, Sledge
-from scenes import UNITS
+from scenes import UNITS, box
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.skins import locate_facets
@@ -25,10 +25,7 @@ def plate(shape, facets, uneven, triangles=False):
     Quadrilaterals in a row, or triangles in three rows.
     """
     cells, kind = (3, CellType.tetrahedron) if triangles else (1, CellType.hexahedron)
-    mesh = create_box(
-        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, cells, 1], kind,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([-END, -0.1, -0.1], [END, 0.1, 0.0], [facets, cells, 1], kind)
     top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     tags = meshtags(
         mesh, 2, np.sort(top), np.full(len(top), 1, np.int32)
@@ -121,8 +118,7 @@ def assert_closed(table, changes, count):
 @pytest.mark.parametrize(
     "variant", [pytest.param("middle", marks=pytest.mark.mpi), "start", "smooth"]
 )
-@pytest.mark.fast("middle")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
     changes, others, table = slide("flat", variant, 0.45, facets=80, uneven=0.25)
     assert_closed(table, changes, 50)
@@ -211,7 +207,7 @@ def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0, arch=False):
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("smoothing", [False, True])
-@pytest.mark.fast("True-hexahedron")
+@pytest.mark.slow
 def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
     tables = []
     for comm in (COMM, MPI.COMM_SELF):

@@ -111,7 +111,7 @@ def test_a_stiff_or_fine_cube_flush_with_a_wall_falls_freely(young, cells, frict
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [50.0, np.inf])
 @pytest.mark.parametrize("meshed", [False, True])
-@pytest.mark.fast_on_ranks("True-inf")
+@pytest.mark.fast_on_ranks()
 def test_a_cube_that_touches_as_far_as_coordinates_tell_falls_freely(meshed, friction):
     """100 m off the origin a turned cube's nodes are off its wall by a hundred times rounding."""
     q, at = turn(0.9), np.full(3, 100.0)
@@ -198,8 +198,7 @@ def _disc(friction):
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("gap", [0.05, 0.0499])
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.fast("energy-momentum-0.05-exact")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_cubes_that_meet_at_the_end_of_a_step(integrator, gap, accuracy):
     """mu = 1e6 binds as no bound does; at 5 m/s a gap of 0.05 m closes after five steps."""
     energies = []

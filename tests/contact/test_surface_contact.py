@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import two_blocks
 from integrators import CONTACT_RULES
-from measures import difference, drift
+from measures import drift
+from pairs import pairs
 from scenes import CELLS, RUBBER, UNITS, at, box, rubbing_blocks, symmetry
 
 import dolfinx_nts as nts
@@ -156,9 +157,7 @@ def assert_kept(run, rule):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", [0.0, 0.4])
-@pytest.mark.parametrize("rule", CONTACT_RULES)
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(("rule", "friction", "cell"), pairs(CONTACT_RULES, [0.0, 0.4], CELLS))
 def test_energy_and_momenta(rule, friction, cell):
     run = impact(rule, friction, cell=CELLS[cell])
     assert_kept(run, rule)
@@ -180,16 +179,6 @@ def test_two_blocks(friction, rubbed):
     assert abs(dissipation - rubbed) < 5e-7
     assert abs(found["energy_lost"] - dissipation - 0.0498) < 5e-5
     assert found["max_active"] == 25 and found["min_gap"] > -1e-12
-
-
-@pytest.mark.mpi
-def test_the_same_on_any_ranks():
-    runs = [impact("energy-momentum", 0.4, 0.05, comm=comm) for comm in (COMM, MPI.COMM_SELF)]
-    for run in runs:
-        assert_kept(run, "energy-momentum")
-    assert difference(*(run.balance for run in runs)) < 1e-10
-    for one, two in zip(*(run.contact_forces[:, 0] for run in runs), strict=True):
-        assert np.abs(one - two).max() < 1e-7 * np.abs(runs[1].contact_forces).max()
 
 
 def handed(integration, swap):

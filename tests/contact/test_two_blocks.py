@@ -120,7 +120,7 @@ def test_bodies_of_a_micrometre():
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_field_split_finds_the_same_solution():
     options = {
         "ksp_type": "fgmres",
@@ -148,8 +148,7 @@ def test_field_split_finds_the_same_solution():
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.fast("energy-momentum-True")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_krylov_follows_the_direct_solver(integrator, condense):
     steppers = [
         nts.Stepper(

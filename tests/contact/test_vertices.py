@@ -47,6 +47,8 @@ def after(system):
 @pytest.mark.mpi
 @pytest.mark.parametrize("exchanged", [False, True])
 @pytest.mark.parametrize("scene", ["vertices", "vertices, turned"])
+@pytest.mark.fast("vertices-True", "vertices, turned-False", "vertices, turned-True")
+@pytest.mark.fast_on_ranks()
 def test_rigid_cubes_that_meet_on_their_axis_exchange_their_velocities(scene, exchanged):
     """An elastic central impact of equal masses; three faces or edges carry alike."""
     found = after(falling(*SCENES[scene], (0.0, 0.0), exchanged, nts.RigidBody))
@@ -56,6 +58,7 @@ def test_rigid_cubes_that_meet_on_their_axis_exchange_their_velocities(scene, ex
 
 
 @pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.fast("vertices")
 def test_it_does_not_matter_which_cube_is_the_slave(scene):
     """Beside the axis one pair of edges carries, in whatever roles."""
     one, two = (after(falling(*SCENES[scene], (0.03, 0.02), e)) for e in (False, True))

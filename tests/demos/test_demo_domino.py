@@ -30,7 +30,7 @@ def test_the_train_begins_as_one_domino_on_a_hinge():
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_the_first_impacts():
     """The first one is met within its step; hinges, floor and push explain the momentum."""
     dt = 2e-3

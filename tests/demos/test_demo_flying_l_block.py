@@ -25,6 +25,7 @@ def check_conserved(result, t_end):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_energy_momentum_conserves_and_midpoint_does_not():
     results = demo.main(t_end=12.0)
     check_conserved(results["energy-momentum"], 12.0)

@@ -55,6 +55,19 @@ def edges(cells, points):
 @pytest.mark.parametrize("n", [4, 16])
 @pytest.mark.parametrize("block", [0.1, 0.001])
 @pytest.mark.parametrize("shape", ["whole", "half", "sphere"])
+@pytest.mark.fast(
+    "whole-0.1-4",
+    "whole-0.1-16",
+    "whole-0.001-4",
+    "whole-0.001-16",
+    "half-0.1-4",
+    "half-0.1-16",
+    "half-0.001-4",
+    "half-0.001-16",
+    "sphere-0.1-4",
+    "sphere-0.1-16",
+    "sphere-0.001-4",
+)
 def test_mesh_is_upright_and_fills_the_body(shape, block, n):
     if shape == "sphere":
         cells, x = half_round.half_sphere(n, 1.0, block)

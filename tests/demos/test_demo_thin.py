@@ -52,6 +52,7 @@ def test_the_plate_rings_at_its_first_frequency():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_leaves_that_slide_on_each_other():
     """Theory's loop; the clamping pressure stiffens the leaves by 1 %."""
     found = leaf_spring.main(cells=8, steps=5, t_end=0.0)

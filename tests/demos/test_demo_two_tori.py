@@ -73,6 +73,7 @@ def test_scene_has_the_mass_and_momentum_of_the_problem(demo):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_impact_keeps_the_balance(demo):
     result = demo["main"](t_end=0.5, comm=COMM)
     assert result["status"] == "completed" and result["retries"] == 0

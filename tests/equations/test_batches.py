@@ -208,6 +208,8 @@ def test_matrix_is_the_derivative_of_the_residual(make):
 @pytest.mark.mpi
 @pytest.mark.parametrize("make", [scene, thin_scene])
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark()])
+@pytest.mark.fast("integrator0-scene")
+@pytest.mark.fast_on_ranks()
 def test_runs_are_the_same(integrator, make, alone):
     """Reactions, ledger and what joints remember, too."""
     runs = [
@@ -285,6 +287,7 @@ def test_plates_sleep_one_by_one(alone):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_bodies_sleep_one_by_one(alone):
     """A blow runs along a row of cubes, which wake up one after the other."""
     seen = []

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from point_mass import PointMass
-from scenes import UNITS
+from scenes import UNITS, box
 
 import dolfinx_nts as nts
 
@@ -20,10 +20,7 @@ DT = 2e-3
 def cube(low, name, *, cells=2, metre=1.0, **options):
     """A unit cube at rest unless said otherwise."""
     low = metre * np.asarray(low, dtype=float)
-    mesh = create_box(
-        COMM, [low, low + metre], [cells] * 3, CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(low, low + metre, cells)
     rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
     return nts.Continuum(mesh, rubber, density=1e2 / metre**3, name=name, **options)
 
@@ -102,7 +99,7 @@ def assert_same(a, b, dt=DT):
     ids=["exact", "reuse"],
 )
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-reuse")
+@pytest.mark.slow
 def test_cubes_sleep_until_they_are_reached(integrator, newton):
     a, b, awake = both(row, 12, integrator=integrator, **newton)
     assert awake[0] == "a" and awake[-1] == "abc" and sorted(awake) == awake
@@ -114,7 +111,7 @@ def test_cubes_sleep_until_they_are_reached(integrator, newton):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_friction_beside_a_sleeper():
     a, b, awake = both(lambda: row(friction=(0.1, 0.0, 0.2)), 8, condense=True)
     assert awake[-1] == "abc" and a.solution.balance["slip"].max() > 0
@@ -166,6 +163,7 @@ def count(body, names, calls):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
     system, calls = row(), []
     s = nts.Stepper(system, nts.EnergyMomentum(), sleep=True)
@@ -272,7 +270,7 @@ MOVERS = {
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", MOVERS)
 @pytest.mark.fast("later body force", "later traction", "later support", "extra form")
-@pytest.mark.fast_on_ranks("later support")
+@pytest.mark.fast_on_ranks()
 def test_loads_wake_in_the_step_in_which_they_act(name):
     a, b, awake = both(beside(**MOVERS[name]), STEPS)
     assert awake == (["a"] * 3 + ["ab"] * 3 if "later" in name else ["ab"] * STEPS)
@@ -307,6 +305,7 @@ def test_gravity_keeps_awake_what_can_fall():
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_an_obstacle_wakes_what_it_reaches(integrator):
     """A wall that touches, and sets out later."""
 
@@ -347,6 +346,7 @@ def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_motion_beyond_the_first_search_wakes_in_the_same_step():
     """Nothing at the start of the step tells how far the force will push."""
     dt, gap = 0.2, 0.2
@@ -374,10 +374,7 @@ def test_a_material_that_changes_wakes():
     """A body at rest that swells as soon as a parameter of its energy says so."""
 
     def moved(sleep):
-        mesh = create_box(
-            COMM, [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [2, 2, 2], CellType.hexahedron,
-            ghost_mode=GhostMode.shared_facet,
-        )  # fmt: skip
+        mesh = box([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], 2)
         swells, base = fem.Constant(mesh, 0.0), nts.StVenantKirchhoff(young=1e4, poisson=0.3)
         body = nts.Continuum(mesh, lambda c: base(c) - swells * ufl.tr(c), density=1e2)
         # The first of bodies that all rest stays awake.

@@ -66,6 +66,7 @@ def test_a_function_of_place_and_time(integrator):
 
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.fast("2")
+@pytest.mark.fast_on_ranks()
 def test_a_function_of_dolfinx(degree):
     """In equilibrium; of another degree it is interpolated."""
     body = block(lambda mesh: function_of(mesh, degree), of_mesh=True)
@@ -73,7 +74,7 @@ def test_a_function_of_dolfinx(degree):
     np.testing.assert_allclose(run.balance["potential"][-1], stored(), rtol=1e-11)
 
 
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_function_changed_between_steps_moves_the_nodes():
     mesh = box()
     moved = function_of(mesh, scale=0.0)

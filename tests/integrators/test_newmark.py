@@ -6,7 +6,6 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import ACCELERATED
 from measures import kinds
 from point_mass import MASS, STEP, PointMass
@@ -132,8 +131,7 @@ def test_the_start_accelerates(integrator):
     """A body under gravity falls from the first step on."""
     gravity = np.array([0.0, 0.0, -9.81])
     body = nts.Continuum(
-        create_box(COMM, [np.zeros(3), np.ones(3)], [2, 2, 2], CellType.hexahedron,
-                   ghost_mode=GhostMode.shared_facet),
+        box(),
         nts.NeoHookean(1e6, 0.3), density=1e3,
     )  # fmt: skip
     stepper = nts.Stepper(nts.System([body], gravity=gravity), integrator)
@@ -150,10 +148,7 @@ def test_the_start_accelerates(integrator):
 @pytest.mark.parametrize("integrator", ACCELERATED.values(), ids=ACCELERATED)
 def test_a_block_that_rests_stays_at_rest(integrator):
     """From equilibrium under the forces of contact: they are part of the first acceleration."""
-    mesh = create_box(
-        COMM, [np.zeros(3), np.ones(3)], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box()
     block = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, name="block")
     pair = nts.ContactPair(
         block.surface(lambda x: x[2] < 1e-9), nts.Plane((0, 0, 0), (0, 0, 1)), friction=0.5

@@ -8,8 +8,8 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from dolfinx.mesh import CellType, GhostMode, create_box
 from point_mass import PointMass
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.output.tables import BalanceCSV
@@ -127,10 +127,7 @@ def test_it_is_of_first_order():
 @pytest.mark.mpi
 def test_it_meets_a_floor_with_friction_and_is_written(mpi_tmp_path):
     """Contact keeps nodes out, friction opposes the slip, and the energy does not grow."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box()
     body = nts.Continuum(
         mesh, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=(1.0, 0.0, -1.0), name="block"
     )

@@ -47,8 +47,7 @@ def test_a_box_at_rest_stays(rule, friction):
 
 @pytest.mark.mpi
 @by_rule
-@pytest.mark.fast("newmark")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_sliding_box_brakes_as_coulomb_says(rule):
     """v = v_0 - mu g t until it rests, at v_0^2 / (2 mu g)."""
     speed, friction, body = 1.0, 0.3, box((0, 0, 0), (1, 1, 0.2), velocity=(1.0, 0, 0))
@@ -71,7 +70,8 @@ def test_a_sliding_box_brakes_as_coulomb_says(rule):
 
 @pytest.mark.mpi
 @by_rule
-@pytest.mark.fast_on_ranks("generalized-alpha")
+@pytest.mark.fast("generalized-alpha")
+@pytest.mark.fast_on_ranks()
 def test_two_boxes_that_meet_keep_their_momentum(rule):
     """Whatever the scheme makes of the energy: the forces are equal and opposite."""
     left = box((-1.02, 0, 0), velocity=(1.0, 0, 0), name="left")

@@ -61,7 +61,7 @@ def exact(t):
 
 
 @pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast("energy-momentum", "generalized-alpha")
+@pytest.mark.fast("energy-momentum")
 def test_a_pendulum_swings_with_second_order(rule):
     errors, t = [], 0.4
     for dt in (0.02, 0.01):

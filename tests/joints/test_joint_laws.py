@@ -59,6 +59,8 @@ def assert_closed(run):
 @pytest.mark.parametrize(
     ("rule", "unit"), zip(MID_STEP.values(), (1.0, 1e-3), strict=True), ids=MID_STEP
 )
+@pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_friction_stops_a_disc(rule, unit):
     """omega = omega_0 - b t/I, until it stands; all of its energy is dissipated."""
     bound, spin = 0.3 * unit**5, 5.0
@@ -118,6 +120,7 @@ def test_a_pendulum_rests_on_its_limit():
     assert rest.reactions["hinge limits"][-1, 1, 1] == pytest.approx(-moment, rel=1e-9)
 
 
+@pytest.mark.fast_on_ranks()
 def test_a_pendulum_bounces_on_its_limit_until_friction_has_it():
     """It never passes the limit, and gains nothing there; at rest, friction and limit carry it."""
     seen = []
@@ -181,6 +184,8 @@ def test_hinges_of_a_long_chain_begin_to_slip(bound):
 
 
 @rules
+@pytest.mark.fast("midpoint")
+@pytest.mark.fast_on_ranks()
 def test_a_slider_with_friction_and_an_end(rule):
     """It slides v^2/(2 b/m) on the level; on a slope it ends at its limit."""
     body, axis, system = slider(0.0, 2.0, friction=nts.JointFriction(bound=3.0))
@@ -194,6 +199,8 @@ def test_a_slider_with_friction_and_an_end(rule):
 
 
 @pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
+@pytest.mark.fast("generalized-alpha")
+@pytest.mark.fast_on_ranks()
 def test_a_controller_holds_an_angle(rule):
     """T = -k (a - a_0) - d da/dt rests where k (a - a_0) is the moment of the weight."""
     stiff, damping, wanted = 50.0, 10.0, 0.3
@@ -225,6 +232,7 @@ def spinning(**laws):
 
 
 @rules
+@pytest.mark.slow
 def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
     """Friction that brakes both, each after v^2 m/(2 b); a motor that makes it a screw."""
     friction = {
@@ -252,6 +260,8 @@ def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
 
 @rules
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.fast("1.0-energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
     """A pendulum on a ball joint with a damper comes to rest 0.4 rad below the horizontal."""
     body = nts.RigidBody.from_inertia(
@@ -273,6 +283,8 @@ def test_a_ball_joint_lets_an_arm_fall_to_its_cone(rule, unit):
 
 
 @pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
+@pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_actuators_make_an_oscillator(rule):
     """T = -k a about an axis, F = -k (l - l_0) along a line: half a period, by the second order."""
     stiff, start = 0.2, 0.5
@@ -294,22 +306,6 @@ def test_actuators_make_an_oscillator(rule):
     assert mass.position == pytest.approx([2.0, 0, 0], abs=2e-4)
     if rule in MID_STEP.values():
         assert_closed(run)
-
-
-def test_a_run_goes_on_with_laws_from_a_checkpoint(tmp_path):
-    laws = {"friction": nts.JointFriction(bound=1.0), "limits": (-1.0, 0.4)}
-    path = COMM.bcast(tmp_path) / "run.h5"
-    body, system = pendulum(**laws)
-    whole = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.6)
-    end = angle(body)
-    _, system = pendulum(**laws)
-    written = nts.Checkpoint(path, every=20)
-    nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.2, checkpoint=written)
-    body, system = pendulum(**laws)
-    start = nts.restart(path, system)
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.6, start=start)
-    assert angle(body) == pytest.approx(end, abs=1e-10)
-    assert np.allclose(run.balance["energy"], whole.balance["energy"], atol=1e-10)
 
 
 @pytest.mark.parametrize("rule", ACCELERATED.values(), ids=ACCELERATED)

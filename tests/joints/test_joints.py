@@ -6,9 +6,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from scenes import UNITS
+from scenes import UNITS, box
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
@@ -125,6 +124,7 @@ def pair(kind):
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", JOINTS)
 @pytest.mark.fast("universal")
+@pytest.mark.fast_on_ranks()
 def test_a_tumbling_pair(kind):
     """Joint, energy and both momenta over 100 steps."""
     a, b, joint, count = pair(kind)
@@ -345,7 +345,7 @@ def tip(angle):
 
 
 @pytest.mark.parametrize("thick", [0.0, pytest.param(0.1, marks=pytest.mark.mpi)])
-@pytest.mark.fast("0.0")
+@pytest.mark.slow
 def test_a_planar_four_bar_with_four_revolutes(thick):
     """Three equations repeat others: solved, on the closed kinematics, of order 2."""
     angles = []
@@ -383,7 +383,7 @@ def test_a_planar_four_bar_with_four_revolutes(thick):
 
 
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.fast("energy-momentum")
+@pytest.mark.slow
 def test_a_slider_crank(integrator):
     """Three revolutes and a prismatic joint, also redundant, on the closed kinematics."""
     angle, length, rate = 0.7, 0.8, 20.0
@@ -515,8 +515,8 @@ def drive(kind, f):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["spherical", "revolute", "prismatic", "distance"])
-@pytest.mark.fast("prismatic", "revolute")
-@pytest.mark.fast_on_ranks("prismatic")
+@pytest.mark.fast("prismatic")
+@pytest.mark.fast_on_ranks()
 def test_a_drive(kind):
     """It goes where it is told, also over many turns, and the ledger knows its work."""
     speed = 12.0 if kind == "revolute" else 0.3
@@ -544,6 +544,7 @@ def test_a_drive(kind):
     stepper.close()
 
 
+@pytest.mark.slow
 def test_the_work_of_a_drive_is_that_of_its_motion():
     """Accelerated translation: m v^2/2; the turns of a hinge: J w^2/2 about it."""
     for kind, speed in (("prismatic", 0.3), ("revolute", 12.0)):
@@ -562,10 +563,7 @@ def test_the_work_of_a_drive_is_that_of_its_motion():
 # ---- flexible bodies
 def cube(low, name, cells=2, **options):
     low = np.asarray(low, dtype=float)
-    mesh = create_box(
-        COMM, [low, low + 1.0], [cells] * 3, CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(low, low + 1.0, cells)
     return nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1.0, name=name, **options)
 
 
@@ -599,6 +597,7 @@ def test_points_of_a_flexible_body():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_tie():
     """A cube tied to a rigid body by a face; both fly and turn, and the face stays as it was."""
     turning = np.array([1.0, 2.0, -1.0])
@@ -805,6 +804,7 @@ def turned(angle):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("adapt", [None, nts.Adapt(tolerance=1e9)])
+@pytest.mark.fast_on_ranks()
 def test_steps_of_half_a_turn_are_cut_from_the_first_one_on(adapt):
     """It cannot be told from half a turn the other way: a motor of 80 rad/s ran at -91."""
     body, system = motor(lambda t: 80.0 * t, 80.0)

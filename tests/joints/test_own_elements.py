@@ -9,8 +9,9 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from integrators import ACCELERATED, INTEGRATORS
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.interaction.elements import evaluate_together
@@ -138,10 +139,7 @@ class _Part:
 
 
 def cube(low, name, velocity=(0.0, 0.0, 0.0), **options):
-    mesh = create_box(
-        COMM, [np.array(low), np.array(low) + 1.0], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box(np.array(low), np.array(low) + 1.0, 2)
     return nts.Continuum(
         mesh, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=velocity, name=name, **options
     )

@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS
 from measures import kinds
-from scenes import UNITS
+from pairs import pairs
+from scenes import UNITS, box
 from scipy.integrate import quad, solve_ivp
 
 import dolfinx_nts as nts
@@ -45,10 +45,7 @@ POINTS = [(0.5, 0.3, -0.2), (2.2, 0.1, 0.4)]
 
 
 def cube(side=1.0, **options):
-    mesh = create_box(
-        COMM, [np.zeros(3), np.full(3, side)], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box((0, 0, 0), np.full(3, side), 2)
     return nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1e3, name="cube", **options)
 
 
@@ -68,9 +65,9 @@ ITEMS = {
 }
 
 
-@pytest.mark.parametrize("rule", [*INTEGRATORS, "static"])
-@pytest.mark.parametrize("item", ITEMS)
-@pytest.mark.parametrize("ground", [None, 0, 1])
+@pytest.mark.parametrize(
+    ("item", "rule", "ground"), pairs(ITEMS, [*INTEGRATORS, "static"], [None, 0, 1])
+)
 def test_tangents_are_derivatives(item, rule, ground):
     a, b = tumbling()
     ends = [None if k == ground else body for k, body in enumerate((a, b))]
@@ -134,7 +131,7 @@ def test_an_energy_that_is_linear_is_a_linear_spring():
 
 @pytest.mark.parametrize("rule", INTEGRATORS)
 @pytest.mark.parametrize("damping", [0.0, 1.5])
-@pytest.mark.fast("0.0-midpoint", "1.5-energy-momentum", "1.5-generalized-alpha")
+@pytest.mark.fast("0.0-midpoint")
 def test_oscillator(rule, damping):
     """Order, and what the damper takes, by the closed form; ends change places."""
     m, k, start, v0, end = 2.0, 30.0, 0.3, 0.8, 1.6
@@ -277,6 +274,7 @@ def test_two_wheels_on_one_axis():
     assert abs(np.log2(errors[0] / errors[1]) - 2.0) < 0.1
 
 
+@pytest.mark.slow
 def test_an_angle_counts_turns_from_where_a_run_goes_on():
     def scene():
         wheel = nts.RigidBody.from_inertia(1.0, (0.3, 0.4, 0.5), angular_velocity=(0, 0, 9.0))
@@ -359,6 +357,7 @@ def test_a_spring_within_a_flexible_body():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_rigid_body_on_a_flexible_one():
     body, ball = cube(velocity=(0.3, 0.0, 0.0)), mass((0.5, 0.5, 2.0), angular_velocity=(3, 2, 1))
     points = [(0.4, 0.5, 1.0), (0.6, 0.5, 1.7)]
@@ -627,6 +626,7 @@ def test_a_damper_that_steps_do_not_resolve_is_told(rule):
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.GeneralizedAlpha()])
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.fast_on_ranks()
 def test_a_stiff_damper_that_is_right_is_not_told(rule, unit):
     """Pulled from rest by F and by F sin(omega t) at c h/m = 100 it has gone F t/c, (1 - cos)/c."""
     c, omega = 1e4, 20.0
@@ -661,12 +661,11 @@ def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
 @pytest.mark.mpi
 @pytest.mark.parametrize("stiffness", [1e4, 1e9])
 @pytest.mark.fast_on_ranks("1000000000.0")
+@pytest.mark.fast("1000000000.0")
 def test_a_body_at_rest_on_an_unstretched_spring_stays_there(stiffness):
     """The spring's force is the rounding of its length, which nothing else in the scene exceeds."""
     low = np.array([3.0, 0.0, 0.0])
-    mesh = create_box(
-        COMM, [low, low + 0.5], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
-    )
+    mesh = box(low, low + 0.5, 2)
     body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3)
     ends = [(3.5, 0.25, 0.25), (5.0, 0.25, 0.25)]
     spring = nts.Spring(body, None, points=ends, stiffness=stiffness)

@@ -170,6 +170,7 @@ def test_a_jump_has_the_mean_velocity_wherever_it_is_in_a_step(rule):
 @few
 @one_on_ranks
 @both
+@pytest.mark.fast("energy-momentum")
 def test_a_drive_that_jumps_has_the_mean_velocity(rule):
     """Of a joint, too, and none as soon as it stays."""
     def speeds(function):
@@ -194,6 +195,7 @@ def test_a_drive_that_jumps_has_the_mean_velocity(rule):
 @few
 @one_on_ranks
 @both
+@pytest.mark.fast("newmark")
 def test_a_constant_that_is_changed_has_the_mean_velocity(rule):
     """Of the step, and none as soon as it stays."""
     mesh = box()
@@ -280,6 +282,7 @@ def test_a_driven_slider_stops(rule):
 
 
 @middle
+@pytest.mark.fast_on_ranks()
 def test_a_driven_hinge_between_free_bodies_keeps_the_momenta(rule):
     """It turns one against the other, and stops: no force from elsewhere."""
     w = 3.0
@@ -302,6 +305,8 @@ def test_a_driven_hinge_between_free_bodies_keeps_the_momenta(rule):
 
 @pytest.mark.parametrize("speed, spin", [(30.0, 0.0), (1e3, 100.0)])
 @pytest.mark.parametrize("kind", [nts.Prismatic, nts.Revolute])
+@pytest.mark.fast("Prismatic-30.0-0.0")
+@pytest.mark.fast_on_ranks()
 def test_a_slow_drive_stops_in_a_scene_that_flies_and_turns(kind, speed, spin):
     """The miss of its velocity was measured by speeds of the bodies: +-0.15 m/s for ever."""
     drive, place, w = 0.25, np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, spin])
@@ -334,6 +339,7 @@ def test_a_slow_drive_stops_in_a_scene_that_flies_and_turns(kind, speed, spin):
 
 @few
 @both
+@pytest.mark.fast_on_ranks()
 def test_a_driven_flexible_body_stops_where_it_is_held(rule):
     """The face that the slider holds is at rest, what it carries goes on to vibrate."""
     body = nts.Continuum(box(), MATERIAL, density=2.0, velocity=(1, 0, 0), name="cube")

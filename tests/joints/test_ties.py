@@ -208,8 +208,8 @@ FLIGHTS = [
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", FLIGHTS)
-@pytest.mark.fast("shell on continuum", "tee")
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("tee")
 def test_joined_bodies_in_flight_keep_what_is_kept(kind):
     """Energy, momentum and angular momentum; ranks give the motion of one."""
     run, x = flight(kind)

@@ -166,6 +166,7 @@ def test_a_part_of_a_mixed_function_is_left_to_dolfinx():
     assert form.value() == pytest.approx(fem.assemble_scalar(form._compiled), rel=1e-13)
 
 
+@pytest.mark.slow
 def test_what_a_fork_interrupts_is_made_again():
     """`multiprocessing` forks on Linux; a child has its parent's objects, not its threads."""
     code = """

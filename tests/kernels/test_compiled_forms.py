@@ -33,7 +33,8 @@ def stretched(material):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("first", "other"), MATERIALS)
-@pytest.mark.fast_on_ranks("first0-other0")
+@pytest.mark.fast("first0-other0", "first1-other1")
+@pytest.mark.fast_on_ranks()
 def test_other_moduli_compile_nothing(first, other, monkeypatch):
     stretched(first)
 
@@ -55,6 +56,7 @@ def test_other_moduli_compile_nothing(first, other, monkeypatch):
     np.testing.assert_allclose(energy, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_users_flags_are_kept(tmp_path):
     """From a file in the working folder, as of DOLFINx; what it does not name stays ours."""
     ours = {"cffi_extra_compile_args": compat.C_FLAGS, "timeout": 600}
@@ -96,6 +98,7 @@ def count_up(mesh, margin):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_what_was_made_before_makes_no_other_forms(monkeypatch):
     mesh = create_box(COMM, [np.zeros(3), np.ones(3)], [2, 1, 1], CellType.hexahedron)
     first = own_scene(mesh)

@@ -9,6 +9,7 @@ import pytest
 from dolfinx.mesh import CellType
 from integrators import GRADIENTS, MID_STEP
 from measures import STENCIL, block_errors, dense, relative
+from pairs import pairs
 from scenes import box, rotated_state, smooth_motion
 
 import dolfinx_nts as nts
@@ -117,7 +118,7 @@ class Linearised:
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize(("cell", "friction", "active"), SCENES)
 @pytest.mark.parametrize("rule", ["energy-momentum", "condensed"])
-@pytest.mark.fast("energy-momentum-hex-none-mixed", "condensed-hex-stick-all")
+@pytest.mark.fast("condensed-hex-stick-all")
 def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
     at = Linearised(system, rule, active, rotated_state(system))
@@ -163,7 +164,7 @@ def test_jacobian_of_a_law_after_sums(rule, cell, friction):
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("rule", EQUATIONS)
-@pytest.mark.fast("energy-momentum", "static")
+@pytest.mark.fast("static")
 def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
@@ -246,27 +247,18 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("rule", EQUATIONS)
-@pytest.mark.parametrize("friction", ["none", "mixed"])
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(
+    ("cell", "friction", "rule"), pairs(CELLS, ["none", "mixed"], EQUATIONS)
+)
 @pytest.mark.fast_on_ranks(
-    "hex-none-static",
-    "tet-mixed-energy-momentum",
-    "smooth-mixed-condensed",
-    "curved-mixed-energy-momentum",
+    "hex-none-static", "tet-mixed-static", "smooth-none-condensed", "curved-none-energy-momentum"
 )
 @pytest.mark.fast(
-    "hex-none-midpoint",
-    "hex-mixed-energy-momentum",
-    "hex-mixed-gonzalez contact",
-    "hex-none-static",
-    "tet-mixed-energy-momentum",
-    "smooth-none-energy-momentum",
-    "smooth-mixed-condensed",
-    "smooth-mixed-midpoint",
-    "curved-mixed-energy-momentum",
-    "curved-mixed-condensed",
-)
+    "hex-mixed-energy-momentum", "hex-none-static", "hex-none-gonzalez contact",
+    "tet-mixed-midpoint", "tet-mixed-static", "smooth-none-condensed",
+    "smooth-mixed-gonzalez contact", "curved-none-energy-momentum",
+    "curved-mixed-mean-value stress",
+)  # fmt: skip
 def test_jacobian_along_directions(cell, friction, rule):
     """As above on any number of ranks: matrix times direction."""
     system = two_blocks(cell, friction=FRICTION[friction])
@@ -344,17 +336,15 @@ def test_newton_converges_quadratically(cell, rule):
 
 
 @pytest.mark.parametrize(
-    ("friction", "changes", "reached"),
-    [(np.inf, False, {2}), (0.02, False, {1}), (0.4, True, {1, 2})],
-    ids=["stick", "slip", "both"],
+    ("cell", "rule", "states"),
+    pairs(CELLS, ["midpoint", "energy-momentum", "condensed"], ["stick", "slip", "both"]),
 )
-@pytest.mark.parametrize("rule", ["midpoint", "energy-momentum", "condensed"])
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.fast(
-    "hex-midpoint-stick", "hex-energy-momentum-both", "smooth-energy-momentum-both",
-)  # fmt: skip
-def test_newton_converges_quadratically_with_friction(cell, rule, friction, changes, reached):
+@pytest.mark.fast("hex-midpoint-stick", "hex-energy-momentum-slip", "smooth-midpoint-both")
+def test_newton_converges_quadratically_with_friction(cell, rule, states):
     """An oblique impact: once stick and slip rest, the distance to the solution is squared."""
+    friction, changes, reached = {
+        "stick": (np.inf, False, {2}), "slip": (0.02, False, {1}), "both": (0.4, True, {1, 2}),
+    }[states]  # fmt: skip
     system = two_blocks(cell, gap=0.02, speed=6.0, friction=friction)
     state = system.initial_state()
     thrown = state.v[0] + np.tile([3.0, 1.2, 0.0], len(state.v[0]) // 3)
@@ -372,8 +362,8 @@ def test_newton_converges_quadratically_with_friction(cell, rule, friction, chan
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.fast("hex", "curved")
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("hex")
 def test_condensing_changes_no_solution(cell):
     results = []
     for rule in ("energy-momentum", "condensed"):

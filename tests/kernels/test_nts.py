@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from facet_kinds import CENTRE, FLAT, KINDS, POWERS, RING
 from measures import STENCIL, differences, relative
+from pairs import pairs
 from rotations import random_rotation
 
 from dolfinx_nts.kernels import discrete_gradient, nts_element
@@ -267,6 +268,7 @@ def random_gaps(rng, n, nc):
 
 
 @pytest.mark.parametrize("nc", KINDS)
+@pytest.mark.fast("3", "4", "16")
 def test_gap_and_its_derivatives(nc):
     """The second one along any direction."""
     rng, rows = np.random.default_rng(8), 8 if nc < 15 else 1
@@ -335,13 +337,7 @@ def test_gap_does_not_depend_on_the_numbering_of_the_corners(nc):
 
 
 # ---- the element in invariants
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("nc", KINDS)
-@pytest.mark.parametrize("motion", [1.0, 0.2, 1e-3])
-@pytest.mark.fast(
-    "1.0-3-gonzalez", "1.0-4-mean-value", "0.2-16-mean-value", "0.2-15-gonzalez",
-    "0.001-16-gonzalez", "0.001-15-mean-value",
-)  # fmt: skip
+@pytest.mark.parametrize(("motion", "nc", "rule"), pairs([1.0, 0.2, 1e-3], KINDS, RULES))
 def test_directionality(nc, rule, motion):
     z0, z1, multiplier = random_step(np.random.default_rng(11), 100, nc, motion)
     # gradbar g . D pi(z_m) . (z_1 - z_0) = gradbar g . (pi_1 - pi_0) = g(pi_1) - g(pi_0)

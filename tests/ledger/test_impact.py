@@ -4,9 +4,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from measures import drift
+from pairs import pairs
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -16,10 +17,7 @@ FLOOR = nts.Plane((0, 0, 0), (0, 0, 1))
 
 def grid(low, size, n):
     low = np.array(low, dtype=float)
-    return create_box(
-        COMM, [low, low + np.array(size)], list(n), CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    return box(low, low + np.array(size), list(n))
 
 
 def cubes(friction=None, gap=0.05, **speeds):
@@ -41,14 +39,9 @@ def cubes(friction=None, gap=0.05, **speeds):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("height", [0.0137, 0.0151])
-@pytest.mark.fast_on_ranks("0.0137-0.5-energy-momentum", "0.0151-1.0-midpoint")
-@pytest.mark.fast(
-    "0.0137-0.0-midpoint", "0.0137-1.0-energy-momentum", "0.0151-0.5-energy-momentum",
-    "0.0151-1.0-midpoint",
-)  # fmt: skip
+@pytest.mark.parametrize(
+    ("integrator", "restitution", "height"), pairs(MID_STEP, [0.0, 0.5, 1.0], [0.0137, 0.0151])
+)
 def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, height):
     """It leaves with e times its speed, wherever in a step its gap closes (by h v = 2 mm)."""
     block = nts.RigidBody(
@@ -56,8 +49,8 @@ def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, heig
     )
     pair = nts.ContactPair(slave=block.surface(lambda x: x[2] < height + 1e-9), master=FLOOR)
     run = nts.simulate(
-        nts.System([block], contacts=[pair]), integrator, dt=1e-3, t_end=0.02, impact="restored",
-        restitution=restitution,
+        nts.System([block], contacts=[pair]), MID_STEP[integrator], dt=1e-3, t_end=0.02,
+        impact="restored", restitution=restitution,
     )  # fmt: skip
     table = run.balance
     assert run.status == "completed" and not run.warnings
@@ -73,8 +66,7 @@ def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, heig
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
-@pytest.mark.fast("balanced")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_flexible_cubes_keep_energy_and_momenta(accuracy):
     """The published scheme loses 8 % of it at this mesh."""
     energy = []
@@ -249,6 +241,7 @@ def test_a_bouncing_ball_rises_by_its_restitution(restitution):
     assert lost == pytest.approx(size * (1.0 - gravitational[-1]), rel=1e-9, abs=1e-11 * size)
 
 
+@pytest.mark.slow
 def test_a_ball_without_restitution_stays_where_it_falls():
     """B24 at e = 0: what its fall brought is lost, and it lies there."""
     height, gravity = 0.1, 9.81

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from measures import PROMISED
 from point_mass import PointMass
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
@@ -29,10 +30,7 @@ def limited(c):
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_a_material_that_is_not_defined_is_named():
-    mesh = create_box(
-        COMM, [np.zeros(3), np.ones(3)], [2, 2, 2],
-        cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box()
     body = nts.Continuum(mesh, limited, density=1e3, velocity=(0.0, 0.0, -20.0), name="fibres")
     pair = nts.ContactPair(
         slave=body.surface(lambda x: x[2] < 1e-9), master=nts.Plane((0, 0, 0), (0, 0, 1))
@@ -160,10 +158,7 @@ def test_an_energy_that_is_no_number_is_grave(integrator, energy):
 
 def vibrating(stiffness):
     """A stretched cube that is let go, of a stiffness that may change."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box()
     young = fem.Constant(mesh, 1e4 * stiffness)
     base = nts.StVenantKirchhoff(1.0, 0.0)
     body = nts.Continuum(
@@ -212,10 +207,7 @@ class Changes:
 @pytest.mark.mpi
 def test_a_stiffness_that_changes_between_load_steps_is_named():
     """What stands under its weight stores 1.75 times as much until it moves."""
-    mesh = create_box(
-        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box()
     young, base = fem.Constant(mesh, 1e6), nts.StVenantKirchhoff(1.0, 0.0)
     held = nts.Dirichlet(lambda x: x[2] < 1e-9)
     body = nts.Continuum(mesh, lambda c: young * base(c), density=1e3, bcs=[held])

@@ -161,6 +161,7 @@ def test_cells_of_the_file_fill_the_body(cell, mpi_tmp_path):
 @mpi
 @pytest.mark.parametrize("cells, degree", [([1, 1, 1], 1), ([2, 1, 1], 2)])
 @pytest.mark.fast_on_ranks("cells0-1")
+@pytest.mark.fast("cells0-1")
 def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], cells)
     body = nts.Continuum(
@@ -363,8 +364,8 @@ def coloured(pixels):
 @mpi
 @pytest.mark.parametrize("colour", ["speed", "stress"])
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
-@pytest.mark.fast("hexahedron-speed", "tetrahedron-stress")
 @pytest.mark.fast_on_ranks("tetrahedron-stress")
+@pytest.mark.fast("hexahedron-speed")
 def test_picture(colour, cell, mpi_tmp_path):
     system = meeting_blocks(cell=cell)
     for body in system.bodies:
@@ -381,7 +382,7 @@ def test_picture(colour, cell, mpi_tmp_path):
 
 
 @mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_picture_has_true_proportions_and_hides_what_is_behind(mpi_tmp_path):
     """Seen along -x, a small fast block in front of a large resting one."""
     back = nts.Continuum(box([0.0, 0, 0], [1.0, 4, 2], [1, 2, 2]), RUBBER, density=1.0, name="b")

@@ -239,8 +239,7 @@ def test_a_full_disk_ends_the_run_with_a_whole_table(mpi_tmp_path):
 
 @mpi
 @pytest.mark.parametrize("kind", ["plot", "picture"])
-@pytest.mark.fast("picture")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_an_old_picture_outlives_a_full_disk(kind, mpi_tmp_path):
     run = nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=2e-3)
     path = mpi_tmp_path / "picture.png"

@@ -10,7 +10,6 @@ import tomllib
 from pathlib import Path
 
 import pages
-import pytest
 from integrators import INTEGRATORS
 from processes import in_fresh_python
 
@@ -64,8 +63,13 @@ def level(module):
     return LEVEL[module.split(".")[0]]
 
 
+@functools.cache
 def imported(module):
-    """Yield the absolute dotted names that a module imports, at its top or inside functions."""
+    """Return the absolute dotted names that a module imports, at its top or inside functions."""
+    return [*_imported(module)]
+
+
+def _imported(module):
     for node in ast.walk(ast.parse(source(module))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -109,10 +113,16 @@ def test_every_module_is_known():
     assert not unknown, f"LEVELS and the files differ in {sorted(unknown)}"
 
 
-@pytest.mark.parametrize("module", PRESENT)
-def test_imports_only_go_down(module):
-    up = {name for name in siblings(module) if level(name) > level(module)}
-    assert not up, f"{module} (level {level(module)}) imports {sorted(up)} from above"
+def offences(found_in, modules=PRESENT):
+    """What is found in a module, by the modules in which it is."""
+    return {module: found for module in sorted(modules) if (found := found_in(module))}
+
+
+def test_imports_only_go_down():
+    def up(module):
+        return {name for name in siblings(module) if level(name) > level(module)}
+
+    assert not offences(up), "these import from above"
 
 
 def test_no_imports_in_a_ring():
@@ -136,18 +146,22 @@ def test_no_rooms_in_a_ring():
     assert not below, f"these import each other in a ring, or stand above one: {sorted(below)}"
 
 
-@pytest.mark.parametrize("module", PRESENT)
-def test_no_module_imports_the_whole_package(module):
-    names = {alias for alias in imported(module) if module != "__init__"}
-    attributes = {n.split(".")[1] for n in names if n.startswith("dolfinx_nts.")} - set(LEVEL)
-    assert not attributes, f"import from the module that defines {sorted(attributes)}"
+def test_no_module_imports_the_whole_package():
+    def attributes(module):
+        names = {n.split(".")[1] for n in imported(module) if n.startswith("dolfinx_nts.")}
+        return names - set(LEVEL)
+
+    found = offences(attributes, set(PRESENT) - {"__init__"})
+    assert not found, "import from the modules that define these"
 
 
-@pytest.mark.parametrize("module", [name for name in PRESENT if name.startswith("kernels.")])
-def test_level_0_knows_neither_mpi_nor_petsc(module):
-    top = {name.split(".")[0] for name in imported(module)}
-    assert not top & {"mpi4py", "petsc4py", "dolfinx"}
-    assert not siblings(module) & KNOW_RANKS
+def test_kernels_know_neither_mpi_nor_petsc():
+    def ranks(module):
+        top = {name.split(".")[0] for name in imported(module)}
+        return top & {"mpi4py", "petsc4py", "dolfinx"} | siblings(module) & KNOW_RANKS
+
+    kernels = [name for name in PRESENT if name.startswith("kernels.")]
+    assert kernels and not offences(ranks, kernels)
 
 
 #: What makes PETSc matrices.
@@ -157,20 +171,24 @@ MATRICES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("module", sorted(set(PRESENT) - MATRICES))
-def test_few_files_create_petsc_matrices(module):
-    makes = re.findall(
-        r"\bMat\(\)|\.create(?:Seq)?S?B?AIJ\(|\.createNest\(", code_without_text(module)
-    )
-    assert not makes, f"{module} makes a PETSc matrix: {makes}"
+def test_few_files_create_petsc_matrices():
+    def makes(module):
+        made = r"\bMat\(\)|\.create(?:Seq)?S?B?AIJ\(|\.createNest\("
+        return re.findall(made, code_without_text(module))
+
+    assert not offences(makes, set(PRESENT) - MATRICES), "these make PETSc matrices"
 
 
-@pytest.mark.parametrize("module", sorted(set(PRESENT) - {"dolfinx_compat"}))
-def test_only_compat_knows_dolfinx_versions(module):
-    code = code_without_text(module)
-    asks = re.findall(r"dolfinx\.__version__|version\(['\"](?:fenics-)?dolfinx['\"]\)", code)
-    asks += re.findall(r"DOLFINX_VERSION|(?:hasattr|getattr)\((?:_?dolfinx|fem|mesh)\b", code)
-    assert not asks, f"{module} asks for the DOLFINx version: {asks}; dolfinx_compat does that"
+def test_only_compat_knows_dolfinx_versions():
+    def asks(module):
+        asked = (
+            r"dolfinx\.__version__|version\(['\"](?:fenics-)?dolfinx['\"]\)"
+            r"|DOLFINX_VERSION|(?:hasattr|getattr)\((?:_?dolfinx|fem|mesh)\b"
+        )
+        return re.findall(asked, code_without_text(module))
+
+    found = offences(asks, set(PRESENT) - {"dolfinx_compat"})
+    assert not found, "these ask for the DOLFINx version; dolfinx_compat does that"
 
 
 SHOW = """
@@ -214,15 +232,15 @@ def scripts():
     yield from ((block.name, block.code) for block in pages.blocks() if block.whole)
 
 
-@pytest.mark.parametrize("name, code", scripts())
-def test_mpi_is_imported_before_dolfinx(name, code):
+def test_mpi_is_imported_before_dolfinx():
     """DOLFINx of PyPI finds its MPI only then."""
-    nodes = [n for n in ast.parse(code).body if isinstance(n, ast.Import | ast.ImportFrom)]
-    names = [getattr(node, "module", None) or node.names[0].name for node in nodes]
-    packages = [name.split(".")[0] for name in names]
-    of_mpi = [packages.index(p) for p in ("mpi4py", "dolfinx_nts") if p in packages]
-    later = [packages.index(p) for p in ("dolfinx", "petsc4py") if p in packages]
-    assert not later or (of_mpi and min(of_mpi) < min(later)), packages
+    for script, code in scripts():
+        nodes = [n for n in ast.parse(code).body if isinstance(n, ast.Import | ast.ImportFrom)]
+        names = [getattr(node, "module", None) or node.names[0].name for node in nodes]
+        packages = [name.split(".")[0] for name in names]
+        of_mpi = [packages.index(p) for p in ("mpi4py", "dolfinx_nts") if p in packages]
+        later = [packages.index(p) for p in ("dolfinx", "petsc4py") if p in packages]
+        assert not later or (of_mpi and min(of_mpi) < min(later)), f"{script}: {packages}"
 
 
 def test_importing_is_cheap():

@@ -204,8 +204,8 @@ def distance(one, other):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.fast_on_ranks("mechanism")
 @pytest.mark.fast("mechanism", "restored")
+@pytest.mark.fast_on_ranks()
 def test_a_restarted_run_is_the_uninterrupted_one(scene, mpi_tmp_path):
     """To the bit; of other integrators to rounding, as tests/conformance/ says."""
     if scene == "adapted" and COMM.size > 1:
@@ -305,6 +305,7 @@ def test_a_rank_that_ends_takes_the_others_along(end, on_ranks, tmp_path):
 
 # ---- how often, and files
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_the_balance_and_its_table_go_on(mpi_tmp_path):
     """A longer run from the end of one; the start can be used again; the CSV is whole."""
     path = mpi_tmp_path / "run.h5"
@@ -343,7 +344,7 @@ def small(comm):
 @pytest.mark.parametrize("make", [small, large, adapted])
 @pytest.mark.parametrize("accuracy", ["exact", "balanced", "fast"])
 @pytest.mark.fast("balanced-small")
-@pytest.mark.fast_on_ranks("balanced-small")
+@pytest.mark.fast_on_ranks()
 def test_matrices_kept_over_steps_are_those_of_the_uninterrupted_run(make, accuracy, mpi_tmp_path):
     """It makes them anew after a checkpoint, too."""
     if make is adapted and COMM.size > 1:
@@ -371,7 +372,8 @@ def series(folder, name="box"):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("cadence", [{"every": 4}, {"interval": 3.5 * DT}], ids=str)
-@pytest.mark.fast_on_ranks("{'every': 4}")
+@pytest.mark.fast("{'every': 4}")
+@pytest.mark.fast_on_ranks()
 def test_fields_go_on_where_the_state_is(cadence, mpi_tmp_path):
     """Those of a run whose last six steps were lost, and of one that ended too early, too."""
     path, whole, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "whole", mpi_tmp_path / "fields"
@@ -916,6 +918,7 @@ def test_the_linear_solver_is_the_one_that_took_over(mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_file_is_as_described(mpi_tmp_path):
     """Read without this package: nodes as the mesh was made, whatever the ranks."""
     path = mpi_tmp_path / "run.h5"

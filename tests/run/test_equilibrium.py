@@ -287,7 +287,7 @@ def test_patch_in_other_units(metre):
 
 # ---- one result, whatever the units and the ranks
 @pytest.mark.parametrize("stabilization", [None, 0.1])
-@pytest.mark.fast("0.1")
+@pytest.mark.slow
 def test_metres_millimetres_micrometres(stabilization):
     gap = 0.0 if stabilization is None else 0.04
     runs = [
@@ -307,6 +307,7 @@ def test_metres_millimetres_micrometres(stabilization):
 @pytest.mark.mpi
 @pytest.mark.parametrize("stabilization", [None, 0.1])
 @pytest.mark.fast_on_ranks("0.1")
+@pytest.mark.fast("None")
 def test_any_number_of_ranks(stabilization):
     gap = 0.0 if stabilization is None else 0.04
     here, alone = (
@@ -325,6 +326,7 @@ def test_any_number_of_ranks(stabilization):
 
 # ---- bodies that contact has to catch
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_stabilization_leaves_nothing_behind():
     """A block that falls on the other: any stabilization ends where one that stood there does."""
     standing = nts.equilibrium(stack(gap=0.0))
@@ -355,6 +357,15 @@ def test_a_body_that_nothing_holds_is_reported():
 @pytest.mark.parametrize("material", [RUBBER, nts.StVenantKirchhoff(young=1e6, poisson=0.3)])
 @pytest.mark.parametrize("above", [None, 0.01])
 @pytest.mark.parametrize("reuse", [False, True])
+@pytest.mark.fast(
+    "False-None-material0",
+    "False-None-material1",
+    "False-0.01-material0",
+    "False-0.01-material1",
+    "True-None-material0",
+    "True-0.01-material0",
+    "True-0.01-material1",
+)
 def test_a_load_that_nothing_carries_is_no_equilibrium(reuse, above, material):
     """Even where Newton runs off to stiffnesses beside which the load is rounding."""
     mesh = box([0, 0, 0], [0.2, 0.2, 0.1], [3, 3, 2], comm=MPI.COMM_SELF)
@@ -478,7 +489,7 @@ def test_passing_by_a_facet_is_noticed(integration):
 # ---- start of a dynamic run
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.fast_on_ranks("midpoint")
+@pytest.mark.fast_on_ranks()
 def test_what_has_settled_stays(integrator):
     """Settled under gravity and left to itself nothing moves, and contact carries on."""
     system = stack()
@@ -498,6 +509,7 @@ def test_what_has_settled_stays(integrator):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_pulled_then_released():
     """The end of the support gone, the stored energy swings and the ledger stays closed."""
     mesh = box([0, 0, 0], [1, 1, 4], [1, 1, 4])
@@ -729,8 +741,8 @@ def wound():
 @pytest.mark.mpi
 @pytest.mark.parametrize("stabilization", [None, 0.1])
 @pytest.mark.parametrize("make", [pulled, hauled, wound])
-@pytest.mark.fast("pulled-None", "hauled-0.1", "wound-0.1")
 @pytest.mark.fast_on_ranks("hauled-0.1")
+@pytest.mark.fast("pulled-None", "wound-0.1")
 def test_what_a_joint_prescribes_does_work(make, stabilization):
     """As loads do: what the ledger misses falls as the square of the load steps."""
     missing = []
@@ -884,6 +896,7 @@ def test_elements_of_ones_own_say_what_work_they_do(stabilization):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_load_step_that_fails_after_others_keeps_what_is_solved():
     """The failed step had other candidates; motions that nothing resists were looked for in it."""
 
@@ -917,6 +930,7 @@ def gent(limit):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_an_energy_that_is_not_defined_is_told():
     """Forces may come out finite where the energy does not."""
     pulled = nts.Dirichlet(at(0, 1.0), lambda t: (2 * t, 0, 0))

@@ -60,6 +60,7 @@ def part():
     return nts.equilibrium(scene(), load_steps=[1 / 6, 1 / 3], **OPTIONS)
 
 
+@pytest.mark.fast_on_ranks()
 def test_going_on_ends_where_the_whole_does(whole, part):
     run = nts.equilibrium(part.system, load_steps=4, start=part, **OPTIONS)
     assert run.status == "completed"
@@ -77,6 +78,7 @@ def test_going_on_from_a_file(whole, part, tmp_path):
         nts.equilibrium(scene(friction=0.2), start=loaded)
 
 
+@pytest.mark.fast_on_ranks()
 def test_going_on_after_a_stop(whole):
     """A hook that raises stops at a third; going on takes other steps than the whole, and ends."""
 
@@ -97,6 +99,7 @@ def test_going_on_after_a_stop(whole):
     assert np.abs(coarse.contact_forces[-1] / whole.contact_forces[-1] - 1)[0, [0, 2]].max() < 0.05
 
 
+@pytest.mark.fast_on_ranks()
 def test_a_dynamic_run_starts_from_a_file(tmp_path):
     held = scene(end=(0.0, 0.0, -0.02))
     settled = nts.equilibrium(held, **OPTIONS)

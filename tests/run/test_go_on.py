@@ -4,9 +4,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS, MID_STEP
-from scenes import rubbing_blocks
+from scenes import box, rubbing_blocks
 
 import dolfinx_nts as nts
 
@@ -17,8 +16,7 @@ DT = 2e-3
 
 @pytest.mark.parametrize(("first_steps", "steps"), [(12, 20), (13, 23)], ids=["12", "13"])
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast_on_ranks()
-@pytest.mark.fast("energy-momentum-13")
+@pytest.mark.slow
 def test_two_parts_are_the_whole(integrator, first_steps, steps):
     """With friction, in contact where the first one ends; on several ranks MUMPS rounds anew."""
     newton = nts.Newton(linear_solver="direct", condense=True)
@@ -40,12 +38,10 @@ def test_two_parts_are_the_whole(integrator, first_steps, steps):
 
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast("midpoint")
 def test_forces_of_supports_and_contacts(integrator):
     """Impulses of supports, floor and gravity add up to the change of momentum."""
-    mesh = create_box(
-        COMM, [np.zeros(3), np.ones(3)], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box()
     rail = nts.Dirichlet(lambda x: x[0] < 1e-9, components=(0,))
     body = nts.Continuum(
         mesh, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=(0, 1, -1), bcs=[rail]
@@ -71,10 +67,7 @@ def held(hold):
     )
 
 
-MESH = create_box(
-    COMM, [np.zeros(3), np.ones(3)], [2, 2, 2], CellType.hexahedron,
-    ghost_mode=GhostMode.shared_facet,
-)  # fmt: skip
+MESH = box()
 
 
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.GeneralizedAlpha()])

@@ -55,7 +55,7 @@ def resident():
 
 
 @pytest.mark.parametrize("left", ["", "kept = scene(COMM)"])
-@pytest.mark.fast("")
+@pytest.mark.slow
 def test_a_destroyed_system_leaves_no_petsc_object(left):
     """PETSc's own list of what was never freed, which names those of a system that is left."""
     code = f"""
@@ -136,6 +136,7 @@ def test_a_stepper_of_a_destroyed_system_says_so():
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_runs_share_the_names_of_their_options():
     """PETSc keeps each prefix that it has seen: new ones took 0.3 kB a run, for ever."""
 
@@ -192,6 +193,7 @@ assert stepper.solution.balance["active"].any()
 """
 
 
+@pytest.mark.slow
 def test_a_stepper_that_nobody_closes_ends_with_python():
     """PETSc would free the preconditioners that Python serves after Python has gone."""
     in_fresh_python(LEFT_OPEN)

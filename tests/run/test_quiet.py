@@ -41,6 +41,7 @@ def run(form, cache, scene="", before=""):
     )
 
 
+@pytest.mark.slow
 def test_a_cold_cache_prints_nothing(tmp_path):
     done = run("w[2] * ufl.dx", tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -63,6 +64,7 @@ nts.simulate(nts.System([body]), nts.Midpoint(), dt=1e-3, t_end=1e-3, progress=T
         assert done.stderr.count("INFO") == 0
 
 
+@pytest.mark.slow
 def test_who_asks_is_told_what_is_compiled(tmp_path):
     asks = "import logging\nlogging.basicConfig(level=logging.INFO)\n"
     done = run("w[1] * ufl.dx", tmp_path, before=asks)
@@ -70,6 +72,7 @@ def test_who_asks_is_told_what_is_compiled(tmp_path):
     assert done.stderr.count("compiling forms of a material or mesh that is new here") == 1
 
 
+@pytest.mark.slow
 def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
     """A compiler that says why and gives up."""
     broken = tmp_path / "cc"
@@ -81,6 +84,7 @@ def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
     assert "no space left" in done.stderr and "Error" in done.stderr
 
 
+@pytest.mark.slow
 def test_without_a_compiler_it_is_said_what_to_install(tmp_path, monkeypatch):
     """In the last line, and without what cffi has called."""
     monkeypatch.setenv("PATH", str(tmp_path))

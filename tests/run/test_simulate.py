@@ -19,6 +19,7 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_cut_back_step_equals_the_small_steps(integrator):
     """Nothing of a rejected step survives: the thirds are those of a run that never tried."""
     tried, plain = (nts.Stepper(two_blocks.scene(COMM), integrator) for _ in range(2))
@@ -68,6 +69,7 @@ def test_writers_see_the_parts_of_a_cut_step():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_failed_run_keeps_what_it_has_and_says_where():
     newton = nts.Newton(max_iterations=1, max_retries=2)
     run = nts.simulate(
@@ -105,6 +107,7 @@ def test_a_single_precision_step_costs_no_precision():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_closed_stepper_goes_on():
     kept, closed = (nts.Stepper(two_blocks.scene(COMM), nts.Midpoint()) for _ in range(2))
     for _ in range(2):
@@ -132,7 +135,8 @@ def block(**options):
     ],
     ids=["moving support", "traction", "body force"],
 )
-@pytest.mark.fast_on_ranks("traction", "body force")
+@pytest.mark.fast("body force")
+@pytest.mark.fast_on_ranks()
 def test_the_work_of_loads_and_supports_closes_the_ledger(options):
     system = nts.System([block(**options)], gravity=(0, 0, -9.81))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.1)
@@ -146,6 +150,7 @@ def test_the_work_of_loads_and_supports_closes_the_ledger(options):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("energy-momentum")
 def test_driven_nodes_have_the_velocity_of_their_support(integrator):
     """They start with it and do not alternate about it; exact for motion at constant speed."""
     speed = np.array([0.5, -0.2, 0.3])

@@ -234,7 +234,7 @@ def impact(comm=COMM, t_end=0.04, tolerance=1e-3, **scene):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_rejected_steps_leave_no_trace():
     """Fixed steps to the accepted times give the same states, and the ledger stays closed."""
     run = impact()
@@ -334,6 +334,7 @@ def test_adapt_is_an_adapt():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_node_that_is_moved_out_is_named(caplog):
     """By one rank; it leaves with 2 gap / h."""
     system, _ = mass_on_wall(-4e-3, velocity=(0.1 * SPEED, 0.0, 0.0))
@@ -369,6 +370,7 @@ def test_writers_see_the_motion_of_supports_from_the_start(mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_longer_run_takes_no_longer_steps():
     """A cube that vibrates while it flies far is followed as closely however far it is to fly."""
 

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, create_box
 from lines import interval_mesh
 from point_mass import MASS, SPEED, STEP, mass_on_wall
 from scenes import CELLS, at, box, everywhere
@@ -159,14 +159,10 @@ def test_constant_values_of_conditions_act_at_once_in_statics():
 
 
 @pytest.mark.parametrize("young", [1e1, 1e4])
-@pytest.mark.fast("10.0")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_stiff_body_on_a_soft_one_is_held(young):
     """Steel that sticks to a pad whose base is fixed: soft is not free."""
-    mesh = create_box(
-        COMM, [np.array([0, 0, -0.5]), np.array([1.0, 1.0, 0.0])], [2, 2, 1], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
+    mesh = box([0, 0, -0.5], [1.0, 1.0, 0.0], [2, 2, 1])
     pad = nts.Continuum(
         mesh, nts.NeoHookean(young, 0.3), density=1e3, name="pad",
         bcs=[nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)],
@@ -269,6 +265,7 @@ def test_restored_impulses_have_no_friction_and_say_so(friction):
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.fast_on_ranks("0.3")
+@pytest.mark.fast("0.3")
 def test_a_weight_below_the_rounding_of_a_stiff_body_is_told(friction):
     """Dust on steel: the weight of 5e-9 N is lost in the forces of the plate's nodes."""
     steel, soft = (nts.NeoHookean(young, 0.3) for young in (2e11, 0.1))

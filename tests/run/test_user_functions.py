@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from pairs import pairs
 from point_mass import PointMass
 from scenes import RUBBER, bottom, box, top
 
@@ -80,13 +81,11 @@ def same_on_all_ranks(value):
     return value
 
 
-@pytest.mark.parametrize("ranks", ["all", "last"])
-@pytest.mark.parametrize("fails", FAILURES)
-@pytest.mark.parametrize("what", NAMES)
+@pytest.mark.parametrize(("what", "fails", "ranks"), pairs(NAMES, FAILURES, ["all", "last"]))
 @pytest.mark.fast(
-    "Dirichlet-nan-last", "Traction-two_numbers-last", "body_force-raises-last", "motion-nan-all",
+    "Dirichlet-nan-last", "Traction-two_numbers-all", "body_force-raises-last", "motion-nan-all",
 )  # fmt: skip
-@pytest.mark.fast_on_ranks("Dirichlet-nan-last", "motion-nan-all")
+@pytest.mark.fast_on_ranks("Dirichlet-nan-last", "body_force-raises-last")
 def test_a_run_keeps_what_it_has(what, fails, ranks):
     system = scene(what, until_late(fails, ranks))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)

@@ -19,6 +19,7 @@ YOUNG, SIDE = 1e6, 0.1
 EULER = np.pi**2 * YOUNG * SIDE**4 / 12 / 4
 
 
+@pytest.mark.slow
 def test_a_ring_that_rolls_over_its_polygon_settles():
     """Nodes that come or go at each side made Newton's method cycle with period 2 (theory 23).
 

@@ -89,6 +89,7 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_mumps_gets_more_workspace_where_it_runs_out_of_it(caplog, capfd):
     """A twentieth of what it guesses is too little: it gets more once, and nobody is told."""
     caplog.set_level("INFO", logger="dolfinx_nts")
@@ -279,7 +280,7 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
     ("cells", "masters"),
     [(1, ()), (4, ()), (4, ("mesh",)), (4, ("sphere",)), (4, ("mesh", "sphere"))],
 )
-@pytest.mark.fast("1-masters0", "4-masters4")
+@pytest.mark.fast("1-masters0")
 def test_matrix_in_blocks_of_nodes(cells, masters):
     """Against AIJ made by way of a nest, with nodes that are held along some axes.
 
@@ -474,6 +475,7 @@ def test_as_many_bodies_as_ranks_need_no_more_iterations_than_one_rank(reuse):
 @pytest.mark.parametrize(
     ("cells", "ranks"), [((4, 4), (1, 2)), ((4, 6), (1,)), ((3, 3, 3, 3), (1, 2, 4))]
 )
+@pytest.mark.fast("cells0-ranks0", "cells1-ranks1")
 def test_bodies_are_dealt_to_ranks_where_they_divide_evenly(cells, ranks):
     stepper = stepper_of(thrown_cubes(COMM, *cells), linear_solver="krylov")
     for _ in range(2):
@@ -520,8 +522,7 @@ def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
-@pytest.mark.fast("True")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_the_choice_changes_no_solution(condense):
     tables = []
     for solver, condensed in (("auto", condense), ("direct", False)):
@@ -611,6 +612,7 @@ def test_equations_that_repeat_others_are_looked_for_where_there_may_be_some(kin
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_of_redundant_contacts_no_equation_repeats_another():
     """MUMPS finds none, and to look for some changes no solution."""
     tables = []

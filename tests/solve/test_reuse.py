@@ -32,7 +32,7 @@ def run(integrator, dt=2e-3, steps=30, system=None, **newton):
 @pytest.mark.mpi
 @pytest.mark.parametrize("solver", ["direct", "krylov"])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("energy-momentum-krylov")
+@pytest.mark.slow
 def test_reuse_changes_no_solution(integrator, solver):
     table, every = run(integrator, linear_solver=solver, condense=True)
     again, some = run(integrator, linear_solver=solver, condense=True, reuse=True)
@@ -46,8 +46,7 @@ def test_reuse_changes_no_solution(integrator, solver):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("reuse", [False, True])
-@pytest.mark.fast("True")
-@pytest.mark.fast_on_ranks("True")
+@pytest.mark.slow
 def test_two_runs_of_one_system_in_turns_are_those_one_after_the_other(reuse):
     """Each finds the bodies' matrix changed by the other one, and makes it anew."""
 
@@ -103,7 +102,7 @@ def test_a_changed_step_makes_new_matrices():
 
 
 @pytest.mark.parametrize("solver", ["direct", "krylov"])
-@pytest.mark.fast("krylov")
+@pytest.mark.slow
 def test_a_step_without_its_last_contact_takes_the_matrices_on(solver):
     """The new layout gets its operator from the matrices kept."""
     mesh = create_box(COMM, [[0, 0, 0.05], [1, 1, 1]], [1] * 3, CellType.hexahedron)
@@ -277,8 +276,8 @@ def arch():
     [(lambda: thrown(0.0), 60, False), (lambda: thrown(2.0), 130, False), (arch, 16, True)],
     ids=["falling", "turning", "arch"],
 )
-@pytest.mark.fast("falling", "arch")
 @pytest.mark.fast_on_ranks("arch")
+@pytest.mark.fast("falling")
 def test_what_iterations_leave_does_not_add_up(system, steps, contact):
     """A hundredth of the 1e-8 that "balanced" may leave, where 100 such steps left all of it."""
     stepper = nts.Stepper(system(), nts.EnergyMomentum(), newton=ACCURACY["balanced"])
@@ -340,7 +339,7 @@ def test_the_step_is_the_same_number_in_all_steps():
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_runs_of_one_system_in_turn_use_no_matrix_of_each_other():
     """A body has one matrix; a run that took it of another step size would hardly converge."""
     system = rubbing_blocks(0.3)
@@ -367,6 +366,7 @@ def test_runs_of_one_system_in_turn_use_no_matrix_of_each_other():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_what_rests_or_is_not_there_is_evaluated_once_a_step():
     """Before the impact all iterates have a body in one place; nothing comes out otherwise.
 

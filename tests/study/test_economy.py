@@ -126,8 +126,8 @@ def test_a_progress_line_and_a_table_without_a_ledger(capsys):
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("midpoint-0.0", "energy-momentum-0.3")
 @pytest.mark.fast_on_ranks("energy-momentum-0.3")
+@pytest.mark.fast("midpoint-0.0")
 def test_far_bodies_have_neither_search_nor_contact_unknowns(monkeypatch, integrator, friction):
     scenes = economy.Economy(COMM, 2)
     feature = dataclasses.replace(FEATURE["declared, far"], friction=friction)
@@ -169,8 +169,8 @@ def test_apart_only_where_the_search_finds_nothing():
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.fast("midpoint-0.3", "energy-momentum-0.0")
 @pytest.mark.fast_on_ranks("energy-momentum-0.0")
+@pytest.mark.fast("midpoint-0.3")
 def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
     """No unknown, no fill, no iteration; gaps and facets are known as if they were."""
     scenes = economy.Economy(COMM, 2)
@@ -203,8 +203,7 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.parametrize("scene", ["smooth", "frictional"])
-@pytest.mark.fast("frictional-energy-momentum")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integrator, scene):
     """Approach, impact and separation."""
     make = {
@@ -335,6 +334,7 @@ print("names:", *(set(sys.modules) - before))
 """
 
 
+@pytest.mark.slow
 def test_a_run_imports_nothing_that_is_off():
     names = in_fresh_python(RUN).split()
     loaded = {name.split(".")[0] for name in names}

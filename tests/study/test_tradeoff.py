@@ -95,6 +95,7 @@ def test_adaptive_steps_beside_equal_ones(script):
     assert fine["trajectory"] < coarse["trajectory"] < 0.1
 
 
+@pytest.mark.slow
 def test_mesh_refinement_compares_with_another_mesh(script):
     rows = tradeoff.compare(script, {"cells": [1, 2, 3]}, {"dt": 0.01}, {"cells": 6}, COMM)
     errors = [r["trajectory"] for r in rows[1:]]
@@ -172,6 +173,7 @@ def test_unknown_scene(tmp_path):
         scene_runs.load(str(empty))
 
 
+@pytest.mark.slow
 def test_command_line(script, tmp_path, capsys):
     folder = tmp_path / "out"
     rows = tradeoff.main(
