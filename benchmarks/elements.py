@@ -8,8 +8,8 @@
 - cook: Cook's membrane in plane strain at nu = 0.49995, small load: the tip beside 16.4326 (Krysl).
 - block: a bonded rubber block, 1 x 1 x 0.5, nu = 0.4999, pressed by 10 %: the force, beside that of
   12 x 12 x 6 hexahedra of degree 2.
-- bracket: an angle of steel, 40 x 40 x 20 mm and 5 mm thick, bolted down at one leg, with a small load at
-  the end of the other: its deflection, beside that of tetrahedra of degree 2 of 1.5 mm.
+- bracket: an angle of steel, 40 x 40 x 20 mm and 5 mm thick, bolted down at one leg, with a small
+  load at the end of the other: its deflection, beside that of tetrahedra of degree 2 of 1.5 mm.
 
 Times are processor time of an `equilibrium` whose forms are compiled, the least of two.
 """
