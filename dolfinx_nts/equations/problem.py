@@ -161,10 +161,12 @@ class StepProblem:
         """Let bodies follow what supports do beside their motion, in the first guess. Collective.
 
         Else the cells at the supports would take all of it: those of a material that hardly changes
-        its volume have no way back from there.
+        its volume have no way back from there. Bodies that may touch stay where they are: what
+        stands in their way is not known yet.
         """
+        touching = set().union(*self.system.pair_bodies)
         for j, body in enumerate(self.batches.bodies):
-            if not body.driven:
+            if not body.driven or touching.intersection(self.batches.numbers[j]):
                 continue
             u0, end, jump = self._u0[j], self.flight.ends[j], np.zeros(body.num_owned)
             jump[body.fixed] = self.flight.jumps[j]

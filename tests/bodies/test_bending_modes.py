@@ -2,18 +2,10 @@
 
 import numpy as np
 import pytest
+from cells import COMM, DEFLECTION, bar, between, differences, distorted, largest, own_energy
 from integrators import MID_STEP
 from rotations import rotation
-from test_projected_volume import (
-    COMM,
-    DEFLECTION,
-    between,
-    box,
-    differences,
-    distorted,
-    largest,
-    own_energy,
-)
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.bodies.solid.step_forms import fill
@@ -28,23 +20,6 @@ def body_of(mesh, material=None, **options):
     return nts.Continuum(mesh, material or nts.NeoHookean(young=1e6, poisson=0.3), **given)
 
 
-def bar(cells, poisson, metre=1.0):
-    """Deflection of a bar under a small load at its end, over load and length."""
-    mesh = box(cells, (np.zeros(3), metre * np.array([10.0, 1.0, 1.0])))
-    load, end = 1e-6, 10.0 * metre * (1 - 1e-9)
-    body = body_of(
-        mesh, nts.NeoHookean(young=1.0, poisson=poisson), density=1.0,
-        bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9 * metre)],
-        traction=[nts.Traction(lambda x: x[0] > end, (0.0, 0.0, load))],
-    )  # fmt: skip
-    run = nts.equilibrium(nts.System([body]))
-    assert run.status == "completed"
-    if poisson < 0.4:
-        assert not run.warnings
-    owned = body.reference.reshape(-1, 3)[:, 0] > end
-    return largest(body.u.x.array[: body.num_owned].reshape(-1, 3)[owned, 2]) / load / metre
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize(
     ("cells", "poisson", "share"),
@@ -55,12 +30,12 @@ def bar(cells, poisson, metre=1.0):
 )  # fmt: skip
 def test_bars_bend_as_in_another_program(cells, poisson, share):
     """Theory 19.5, per cent of the reference; without modes 88, 80, 65, 20, 18 and 1."""
-    assert 100.0 * bar(cells, poisson) / DEFLECTION[poisson] == pytest.approx(share, abs=0.1)
+    assert 100.0 * bar(cells, poisson, bending=True) / DEFLECTION[poisson] == pytest.approx(share, abs=0.1)
 
 
 @pytest.mark.parametrize("metre", [1e-3, 1e3])
 def test_units_of_a_bar(metre):
-    assert bar((10, 1, 1), 0.3, metre) == pytest.approx(bar((10, 1, 1), 0.3), rel=1e-9)
+    assert bar((10, 1, 1), 0.3, metre, bending=True) == pytest.approx(bar((10, 1, 1), 0.3, bending=True), rel=1e-9)
 
 
 def test_a_strip():
@@ -68,7 +43,7 @@ def test_a_strip():
     ends = []
     for options in ({}, {"bending": False, "degree": 2}, {"bending": False}):
         body = body_of(
-            box((20, 2, 2), (np.zeros(3), np.array([10.0, 1.0, 0.1]))),
+            box(np.zeros(3), np.array([10.0, 1.0, 0.1]), (20, 2, 2)),
             nts.NeoHookean(young=1.0, poisson=0.3),
             bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
             traction=[nts.Traction(lambda x: x[0] > 10 - 1e-9, (0.0, 0.0, 1e-9))], **options,
@@ -160,7 +135,7 @@ def spinning(**options):
     def thrown(x):
         return np.array([0.3 * x[2], 4.0 * (x[0] - 1.0), 2.0 * np.cos(x[0])])
 
-    mesh = box((6, 2, 1), ((0.0, 0.0, 0.0), (2.0, 0.4, 0.2)))
+    mesh = box((0.0, 0.0, 0.0), (2.0, 0.4, 0.2), (6, 2, 1))
     return nts.System([body_of(mesh, nts.NeoHookean(1e5, 0.3), velocity=thrown, **options)])
 
 
@@ -199,9 +174,9 @@ def test_order_two():
 
 @pytest.mark.mpi
 def test_contact_with_friction_closes_the_ledger():
-    a = body_of(box((3, 3, 1), ((0, 0, 0), (1.0, 1.0, 0.3))), name="a", velocity=(0.5, 0.0, -3.0))
+    a = body_of(box((0, 0, 0), (1.0, 1.0, 0.3), (3, 3, 1)), name="a", velocity=(0.5, 0.0, -3.0))
     ends = ((-0.1, -0.1, -0.304), (1.1, 1.1, -0.004))
-    b = body_of(box((4, 4, 1), ends), name="b")
+    b = body_of(box(*ends, (4, 4, 1)), name="b")
     contact = nts.ContactPair(
         a.surface(lambda x: x[2] < 1e-9), b.surface(lambda x: x[2] > -0.004 - 1e-9), friction=0.3
     )
@@ -240,7 +215,7 @@ def test_a_body_starts_bent():
     """What is released from a bent place has the modes of it: equilibrium, then the run."""
     load = nts.Traction(lambda x: x[0] > 2 - 1e-9, lambda t: (0.0, 0.0, 300.0 * min(t, 1.0)))
     held = {"bcs": [nts.Dirichlet(lambda x: x[0] < 1e-9)], "velocity": (0, 0, 0)}
-    mesh = box((6, 2, 1), ((0.0, 0.0, 0.0), (2.0, 0.4, 0.2)))
+    mesh = box((0.0, 0.0, 0.0), (2.0, 0.4, 0.2), (6, 2, 1))
     bent = nts.System([body_of(mesh, nts.NeoHookean(1e5, 0.3), traction=[load], **held)])
     static = nts.equilibrium(bent)
     free = nts.System([body_of(mesh, nts.NeoHookean(1e5, 0.3), **held)])
@@ -270,7 +245,7 @@ def test_compressed_cells_are_told():
     """Where the least eigenvalue of C falls below 0.56 (theory 19.4), and not before."""
     for pressed, told in ((0.22, False), (0.28, True)):
         body = body_of(
-            box((2, 2, 2)),
+            box(cells=(2, 2, 2)),
             bcs=[
                 nts.Dirichlet(lambda x: x[2] < 1e-9, components=[2]),
                 nts.Dirichlet(
@@ -295,4 +270,4 @@ def test_compressed_cells_are_told():
 )
 def test_refused(options, told):
     with pytest.raises((ValueError, TypeError), match=told):
-        body_of(box((2, 2, 2)), **options)
+        body_of(box(cells=(2, 2, 2)), **options)

@@ -128,11 +128,14 @@ class Continuum(UflBody):
         bending: bool = False,
     ) -> None:
         _check_material(material, density)
+        for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
+            if value is not None and not (is_whole(value) and value > 0):
+                raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         least = check_mesh(mesh, name)
-        degree = _checked_degree(degree, quadrature_degree, least, name)
-        _check_cells(mesh, degree, name, volume, bending)
+        degree = degree or least
+        _check_cells(mesh, degree, least, name, volume, bending)
         quadrature_degree = quadrature_degree or 2 * degree
         super().__init__(
             compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
@@ -410,24 +413,15 @@ def _check_material(material: Any, density: Parameter) -> None:
     require_positive_parameter("density", density, "kg/m^3")
 
 
-def _checked_degree(
-    degree: int | None, quadrature_degree: int | None, least: int, name: str
-) -> int:
-    """The polynomial degree, by default that of the mesh."""
-    for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
-        if value is not None and not (is_whole(value) and value > 0):
-            raise ValueError(f"{option}={value!r}: must be a positive integer")
-    degree = degree or least
+def _check_cells(
+    mesh: Mesh, degree: int, least: int, name: str, volume: str, bending: bool
+) -> None:
+    """Raise unless cells, of a mesh of degree `least`, can have what they are to have."""
     if degree < least:
         raise ValueError(
             f"degree={degree!r} of {name!r}: its mesh is of degree {least}; leave degree out, "
             "or pass nts.linear(mesh)"
         )
-    return degree
-
-
-def _check_cells(mesh: Mesh, degree: int, name: str, volume: str, bending: bool) -> None:
-    """Raise unless cells can have what keeps them from locking."""
     require_one_of("volume", volume, ("full", "projected"))
     require_bool("bending", bending)
     kind = compat.cell_name(mesh)
