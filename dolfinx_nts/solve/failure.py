@@ -55,13 +55,15 @@ def diagnosis(
     }
     for kind, hint in kinds.items():
         endless = [
-            body.name
+            body
             for body, terms in bodies
             if not everywhere(problem.system.comm, np.isfinite(getattr(terms, kind)).all())
         ]
         if endless:
-            names = ", ".join(map(repr, endless))
+            names = ", ".join(repr(body.name) for body in endless)
             why += f"; the {kind} forces of {names} are not finite: {hint}"
+            if kind == "internal" and any(body.has_inner for body in endless):
+                why += ", or its cells have folded: leave bending=True out"
     top += _held_twice(problem, e)
     finite = ratio[worst] < np.inf
     size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
