@@ -39,8 +39,10 @@ from dolfinx_nts.types import FloatArray
 
 #: A motion of supports goes on as before if it differs by less than this part.
 _STEADY = 1e-6
-#: Part of a motion of supports that tells which forces it makes.
-_TRIED = 1e-3
+#: Motion of supports, over the scene, that tells which forces they make.
+_TRIED = 1e-7
+#: How much farther than its supports a body may come, as the end of a beam whose other end turns.
+_FARTHEST = 1e3
 
 
 class StepProblem:
@@ -174,14 +176,15 @@ class StepProblem:
             largest, moved = global_max(self.system.comm, sizes)
             if not largest > _STEADY * moved:
                 continue
-            pull = (body.internal(u0 + _TRIED * jump) - body.internal(u0)) / _TRIED
+            part = _TRIED * self.lengths.radius / largest
+            pull = (body.internal(u0 + part * jump) - body.internal(u0)) / part
             pull[body.fixed] = 0.0
             saddle = Saddle(self.tangents.of_all(j, u0))
             way = saddle.solve(-pull)
             saddle.destroy()
             way[body.fixed] = 0.0
             far = global_max(self.system.comm, np.abs(way).max(initial=0.0, keepdims=True))[0]
-            if far <= self.lengths.radius:
+            if far <= _FARTHEST * largest:
                 end += way
 
     @property

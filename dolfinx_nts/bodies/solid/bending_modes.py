@@ -14,12 +14,18 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.solid.cell_means import EntriesOfCells, NodesOfCells
 from dolfinx_nts.forms import CellForm, compile_forms
+from dolfinx_nts.interaction.coupling import StepWarning
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.types import FloatArray
 
 #: Numbers of a cell: a vector for each of its directions.
 _WIDTH = 9
 #: Rounds in which the modes of all cells are solved for.
 _ROUNDS = 40
+#: Distortion of cells from which on modes do not let them bend freely.
+_DISTORTED = 0.2
+#: Least eigenvalue of C from which on cells with modes are stable (0.48 at nu = 0.4999).
+_FOLDS = 0.56
 #: A change of the modes that is rounding, over the modes, and of F = 1.
 _ROUNDED = 2.0 * float(np.finfo(float).eps)
 #: Largest change in a round.
@@ -62,6 +68,12 @@ class BendingModes:
         #: Derivatives of the corners' shape functions in the centre [1/m], shape (cells, 8, 3).
         self._slopes = np.einsum("kj,cji->cki", corners / 8.0, rows)[own]
         self._shortest = np.linalg.norm(jacobian, axis=1).min(axis=1)[own]
+        sides = 2.0 * np.linalg.norm(jacobian[own], axis=1)
+        off = x[own] - x[own].mean(axis=1, keepdims=True)
+        off = np.linalg.norm(off - np.einsum("kj,cij->cki", corners, jacobian[own]), axis=2)
+        thin = sides.min(axis=1)
+        #: How far corners are from a parallelepiped, over the thickness and times the slenderness.
+        self._distortion = float((off.max(axis=1) * sides.max(axis=1) / thin**2).max(initial=0.0))
         size = np.linalg.norm(rows, axis=2)
         # DOLFINx's cells are one wide.
         factor = -8.0 * np.linalg.det(jacobian)[:, None] / size
@@ -74,12 +86,34 @@ class BendingModes:
         spread = np.ptp(corners.reshape(len(corners), -1, 3), axis=1).max(axis=1)
         return float((spread / self._shortest).max(initial=0.0))
 
-    def least_stretch(self, corners: FloatArray) -> float:
-        """Least eigenvalue of C in the centre of a cell, of displacements (cells, 24) [m]."""
+    def doubts(self, name: str, corners: FloatArray) -> list[StepWarning]:
+        """What is wrong with the cells of a body of that name, as of `Body.doubts`. Collective.
+
+        Args:
+            name: Of the body.
+            corners: Displacements of the cells' corners [m], shape (cells, 24).
+        """
         h = np.einsum("cki,ckj->cij", corners.reshape(len(corners), 8, 3), self._slopes)
         f = h + np.eye(3)
         c = np.einsum("cki,ckj->cij", f, f)
-        return float(np.linalg.eigvalsh(c).min(initial=np.inf))
+        least = float(np.linalg.eigvalsh(c).min(initial=np.inf))
+        top = global_max(self.space.mesh.comm, np.array([self._distortion, -least]))
+        distortion, least, found = float(top[0]), -float(top[1]), []
+        if distortion > _DISTORTED:
+            text = (
+                f"cells of body {name!r} are too far from parallelepipeds for bending=True, by "
+                f"{distortion:.2g}, of which {_DISTORTED} costs several per cent and 1 most of it: "
+                "it may be too stiff; use more cells along curves, regular ones, or degree=2"
+            )
+            found.append(StepWarning("distorted cells", distortion, text, (name,)))
+        if least < _FOLDS:
+            text = (
+                f"a cell of body {name!r} is compressed to {max(least, 0.0) ** 0.5:.2g} of a "
+                "length, where bending=True lets it fold for nothing; leave bending out, or pass "
+                "degree=2"
+            )
+            found.append(StepWarning("folding cells", _FOLDS - least, text, (name,)))
+        return found
 
     def gradient(self, modes: Any) -> Any:
         """What modes add to the displacement gradient (UFL), shape (3, 3)."""

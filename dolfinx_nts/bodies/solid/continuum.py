@@ -27,7 +27,7 @@ from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, global_max, global_sum, raise_together
+from dolfinx_nts.parallel import anywhere, global_sum, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
@@ -45,8 +45,8 @@ _STRESS_FREE = 1e-6
 _SMALL_STRAIN = 1e-4
 #: Bulk over shear modulus from which on cells of degree 1 lock in any motion (nu = 0.499).
 _INCOMPRESSIBLE = 500.0
-#: Least eigenvalue of C from which on cells with modes are stable (0.48 at nu = 0.4999).
-_FOLDS = 0.56
+#: Strain that is rounding.
+_ROUNDED_STRAIN = 1e-12
 #: Largest spread of a body's nodes over the least from which on it may bend: a bar or plate of one
 #: cell over the thickness is some 4 times as long as thick.
 _THIN = 2.3
@@ -86,8 +86,9 @@ class Continuum(UflBody):
             run stops where that does not help. W(C) cannot see it.
         bending: Let hexahedra of degree 1 bend as thin parts do, without the shear that makes them
             too stiff: by three vectors within each cell, which follow from the displacement and
-            from the step before (theory 19.4). For thin and stiff parts; where a cell is compressed
-            to about 0.6 of a length it may fold, which a run warns of.
+            from the step before (theory 19.4). For thin and stiff parts whose cells are nearly
+            parallelepipeds. A run warns of others, and of cells that are compressed to about 0.6 of
+            a length, where they may fold.
         volume: "projected": W takes the change of volume of each cell in the mean, so that cells do
             not lock where the material hardly changes its volume (nu near 0.5), and bend more
             easily; for hexahedra of degree 1. "full": W at each point, as it is.
@@ -276,7 +277,12 @@ class Continuum(UflBody):
         jumps, means = self._jumps
         if means is not None:
             means.evaluate()
-        return jumps.sums()
+        found = jumps.sums()
+        here = self.potential(self.u.x.array[: self.num_owned])
+        stored = abs(float(global_sum(self.comm, np.array([here]))[0]))
+        # Stress times strain is twice the energy. Where nothing is strained all stress is rounding.
+        strained = 2.0 * stored > _ROUNDED_STRAIN * math.sqrt(found[1] * jumps.volume)
+        return found if strained else np.zeros(2)
 
     @property
     def remedy_of_locking(self) -> str:
@@ -286,7 +292,8 @@ class Continuum(UflBody):
         if self._modes is not None:
             return "use degree=2, or a finer mesh"
         if self._linear and self._volume == "full":
-            return "use volume='projected', bending=True in thin and stiff parts, or a finer mesh"
+            thin = "bending=True in thin, stiff parts of regular cells"
+            return f"use volume='projected', {thin}, or a finer mesh"
         return "use a finer mesh"
 
     @property
@@ -334,19 +341,11 @@ class Continuum(UflBody):
         return self._forms.inner_at_rest(self.initial_displacement)
 
     def doubts(self, u: FloatArray) -> list[StepWarning]:
-        """As of `Body`: where cells with modes may fold (theory 19.4)."""
+        """As of `Body`."""
         if self._modes is None:
             return []
         corners = self._forms.with_ghosts(u)[self._nodes_of_cells.dofs]
-        least = -float(global_max(self.comm, np.array([-self._modes.least_stretch(corners)]))[0])
-        if least >= _FOLDS:
-            return []
-        text = (
-            f"a cell of body {self.name!r} is compressed to {math.sqrt(max(least, 0.0)):.2g} of a "
-            "length, where bending=True lets it fold for nothing; leave bending out, or pass "
-            "degree=2"
-        )
-        return [StepWarning("folding cells", _FOLDS - least, text, (self.name,))]
+        return self._modes.doubts(self.name, corners)
 
     @cached_property
     def _nodes_of_cells(self) -> NodesOfCells:

@@ -26,6 +26,9 @@ class StressJumps:
         stress: Symmetric tensor in UFL [Pa].
         mesh: DOLFINx mesh.
         dx: Measure of the energy.
+
+    Attributes:
+        volume: Of the mesh [m^3].
     """
 
     def __init__(self, stress: Any, mesh: Any, dx: Any) -> None:
@@ -43,9 +46,11 @@ class StressJumps:
         sums = ufl.inner(stress, ufl.TestFunction(tensors)) * at_corners
         weights = ufl.as_ufl(1.0) * ufl.TestFunction(numbers) * at_corners
         jump = stress - self._smooth
-        self._sums, weigh, *self._squares = compile_forms(
-            [sums, weights, ufl.inner(jump, jump) * dx, ufl.inner(stress, stress) * dx]
+        one = fem.Constant(mesh, 1.0)
+        self._sums, weigh, volume, *self._squares = compile_forms(
+            [sums, weights, one * dx, ufl.inner(jump, jump) * dx, ufl.inner(stress, stress) * dx]
         )
+        self.volume = float(global_sum(self._comm, np.array([volume.value()]))[0])
         self._vector, shares = (petsc_compat.create_vector(s) for s in (tensors, numbers))
         assemble_vector(shares, weigh)
         self._weights = shares.array_r.copy()
