@@ -57,10 +57,6 @@ class Corners(FacetPair):
         start = super().history_at_start()
         return start._replace(followed=~start.followed)
 
-    def _told(self, hidden: Candidates, current: IntArray) -> Candidates:
-        """None: what passes by a face is told where bodies are looked at as a whole."""
-        return hidden.select(np.zeros(len(hidden.node), dtype=bool))
-
     def borne(self, history: ContactHistory) -> float:
         """Sum of the forces that they bear [N]. Collective."""
         return float(global_sum(self.slave.body.comm, history.force.sum(keepdims=True))[0])

@@ -88,14 +88,11 @@ class Found(NamedTuple):
         followed: Which of the rank's slave nodes are known not to have passed by the surface's
             edge, shape (share,).
         cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
-        beside: How deep, in facet sizes, the deepest node that is let through lies behind its
-            facet, and its input number; (0, -1) without one.
     """
 
     candidates: Candidates
     followed: BoolArray
     cover: float
-    beside: tuple[float, int] = (0.0, -1)
 
 
 @known_options
