@@ -35,7 +35,7 @@ CORNER_TETS = np.array([[c, c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
 #: Edges of a tetrahedron.
 PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 #: Kinds of warnings that tell of bodies inside each other, and of bodies and obstacles.
-OVERLAPS = {"edge through a body", "node inside a body", "node beside a surface"}
+OVERLAPS = {"edge through a body", "node inside a body"}
 IN_OBSTACLES = {
     "facet in an obstacle", "node in an obstacle", "obstacle in a body",
     "facet starts in an obstacle",

@@ -17,7 +17,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
 from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
-from dolfinx_nts.contact.left_behind import beside, unheld
+from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before
 from dolfinx_nts.interaction.coupling import StepWarning
@@ -48,8 +48,6 @@ class ContactSearch:
         elements: Candidates of each of these that have unknowns in this step.
         idle: The others, which the step's motion does not bring to their masters.
         idle_gaps: Gaps [m] of the idle candidates of each in the last solution.
-        beside: Of each contact, how deep in facet sizes the deepest of this rank's nodes that
-            passed the surface's edge lies behind it at t_n, and its input number.
     """
 
     def __init__(
@@ -62,7 +60,6 @@ class ContactSearch:
         self.elements: list[ContactElements] = []
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
-        self.beside = [(0.0, -1)] * len(contacts)
         self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
         number = {id(pair): k for k, pair in enumerate(contacts)}
         self._corners = [(c, number[id(c.of)]) for c in contacts if isinstance(c, Corners)]
@@ -201,7 +198,7 @@ class ContactSearch:
     def _find(self, k: int, reach: float) -> ContactElements | None:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self._of[k], self._step
         positions = self._positions(k)
-        found, self._followed[k], self._cover[k], self.beside[k] = pair.find(
+        found, self._followed[k], self._cover[k] = pair.find(
             positions,
             self._old[k].facet,
             path,
@@ -369,11 +366,8 @@ class ContactSearch:
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:
-        """Nodes that an accepted step leaves beside or behind a surface."""
-        found = unheld(self._comm, self.elements, parts)
-        if not self._step.integrator.inertia:
-            return list(found)  # what a load step passes by is looked for
-        return [*beside(self._comm, self._pairs, self.beside), *found]
+        """Nodes that an accepted step leaves behind a surface without contact."""
+        return list(unheld(self._comm, self.elements, parts))
 
     # ---- first guesses, and what leads to a solution
     def guess(self, k: int, x: FloatArray) -> FloatArray:

@@ -194,15 +194,10 @@ class FacetPair(ContactPair, master=Surface):
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
         stays[node], stays[let_go] = known[node], False
-        hidden, deepest = self._told(found.select(beside), current), (0.0, -1)
-        if len(hidden.node):
-            depth = -hidden.gap / hidden.length
-            node = self.slave.share[hidden.node[depth.argmax()]]
-            deepest = float(depth.max()), int(self.slave.original[node])
         found = found.select(~beside)
         stays[found.node] = True
         found = found._replace(gap=found.gap - self.offset[found.node])
-        return Found(found, stays, cover, deepest)
+        return Found(found, stays, cover)
 
     def _closest(
         self, slaves: FloatArray, corners: FloatArray, reach: float, current: IntArray
@@ -231,10 +226,6 @@ class FacetPair(ContactPair, master=Surface):
             for values, better in zip(found, other, strict=True):
                 values[again[meet]] = better[meet]
         return found
-
-    def _told(self, hidden: Candidates, current: IntArray) -> Candidates:
-        """Those of nodes behind the surface that nothing else keeps from sinking in. Collective."""
-        return hidden
 
     def stops(self, node: IntArray, master: FloatArray) -> passages.Stops | None:
         """Which facets may stop these of the rank's slaves on their paths; None: all.

@@ -1,4 +1,4 @@
-"""Nodes that an accepted step leaves beside a surface, or behind it without contact."""
+"""Nodes that an accepted step leaves behind a surface without contact."""
 
 from __future__ import annotations
 
@@ -10,39 +10,11 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution
-from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.parallel import global_max
 
-#: Depth in facet sizes from which on a node behind a surface that it passed by is told.
-_BESIDE = 1e-3
 #: Depth in facet sizes from which on a node is told that lies behind its facet without a force.
 _UNHELD = 1e-6
-
-
-def beside(
-    comm: MPI.Comm, pairs: Sequence[ContactPair], deepest: Sequence[tuple[float, int]]
-) -> Iterator[StepWarning]:
-    """Nodes that have passed by a surface's edge and lie behind it. Collective.
-
-    Args:
-        comm: MPI communicator.
-        pairs: The contacts.
-        deepest: Of each, this rank's deepest such node: depth in facet sizes, and input number.
-    """
-    depths = global_max(comm, np.array([depth for depth, _ in deepest]))
-    if depths.max(initial=0.0) <= _BESIDE:
-        return
-    found = comm.allgather(deepest)
-    for k in np.flatnonzero(depths > _BESIDE):
-        depth, node = max(of_rank[k] for of_rank in found)
-        name = pairs[k].name
-        text = (
-            f"node {node} of contact {name!r} has passed the master's edge and lies {depth:.3g}"
-            " of a facet behind its surface, where nothing holds it; let the master's surface "
-            "reach farther"
-        )
-        yield StepWarning("node beside a surface", float(depth), text, (name,))
 
 
 def unheld(

@@ -88,14 +88,11 @@ class Found(NamedTuple):
         followed: Which of the rank's slave nodes are known not to have passed by the surface's
             edge, shape (share,).
         cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
-        beside: How deep, in facet sizes, the deepest node that is let through lies behind its
-            facet, and its input number; (0, -1) without one.
     """
 
     candidates: Candidates
     followed: BoolArray
     cover: float
-    beside: tuple[float, int] = (0.0, -1)
 
 
 @known_options
@@ -125,8 +122,8 @@ class ContactPair:
             where their meshes are, and may be that deep inside each other without a warning. At
             most half a facet of the master inwards; edges stay as meshed [m].
         edges: Whether sharp edges of solid and rigid bodies are kept out of each other, too, and
-            the master's nodes there out of the slave's facets; else they may pass between the
-            slave's nodes, mostly without a word.
+            the master's nodes there and at round places out of the slave's facets; else they may
+            pass between the slave's nodes, mostly without a word.
         integration: What of the slave is kept out: its "nodes", or the "surface" between them in
             the mean around each node, by points of all facets (theory section 17).
 

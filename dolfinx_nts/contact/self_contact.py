@@ -203,10 +203,6 @@ class SelfContact(FacetPair):
             hit[(hit >= 0) & (held < 0) & self._carries(held)[hit]] = -1
         return hit
 
-    def _told(self, hidden: Candidates, current: IntArray) -> Candidates:
-        """As of `FacetPair`: not those whose facets are held out of their own part."""
-        return hidden.select(~self._carries(current)[hidden.facet])
-
     def _carries(self, at: IntArray) -> BoolArray:
         """Which facets have corners that are at other facets, shape (m,). Collective.
 
