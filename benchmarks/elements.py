@@ -5,7 +5,8 @@
 
 - roller: a cantilever of 10 x 1 x 1 at nu = 0.3 that a rigid cylinder lifts at 9 of its length: the
   contact force beside 3 EI w/a^3.
-- cook: Cook's membrane in plane strain at nu = 0.49995, small load: the tip beside 16.4326 (Krysl).
+- cook: Cook's membrane in plane strain at nu = 0.499975, small load: the tip beside 16.4326 of
+  Krysl.
 - block: a bonded rubber block, 1 x 1 x 0.5, nu = 0.4999, pressed by 10 %: the force, beside 0.0475,
   to which a quarter of 2^3, 4^3, 8^3 and 12^3 projected hexahedra leads (0.0571, 0.0515, 0.0492,
   0.0484).

@@ -200,15 +200,16 @@ class System:
 
     def initial_state(self) -> State:
         """Bodies with their initial displacements and velocities at t = 0."""
+        u = tuple(self._at_start(b) for b in self.bodies)
         return State(
             time=0.0,
-            u=tuple(self._at_start(b) for b in self.bodies),
+            u=u,
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
             contacts=tuple(c.history_at_start() for c in self.pairs),
             joints=tuple(joint.start() for joint in self.joints),
             edges=tuple(EdgeHistory.of_start() for _ in self.contacts),
-            inner=self.inner_of(lambda k: self.bodies[k].inner_at_start),
+            inner=self.inner_of(lambda k: self.bodies[k].inner_at_rest(u[k])),
         )
 
     def inner_of(self, each: Callable[[int], FloatArray]) -> tuple[FloatArray, ...]:
@@ -218,10 +219,10 @@ class System:
         none = np.empty(0)
         return tuple(each(k) if b.has_inner else none for k, b in enumerate(self.bodies))
 
-    def take_inner(self, state: State) -> None:
-        """Give its bodies what `State.inner` has of them."""
-        for body, inner in zip(self.bodies, state.inner, strict=False):
-            body.take_inner(inner)
+    def take_inner(self, inner: tuple[FloatArray, ...]) -> tuple[FloatArray, ...]:
+        """Give its bodies a `State.inner`, and return the one that they had."""
+        both = zip(self.bodies, inner, strict=False)
+        return tuple(body.take_inner(own) for body, own in both)
 
     @cached_property
     def has_inner(self) -> bool:

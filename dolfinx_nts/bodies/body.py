@@ -138,13 +138,12 @@ class Body:
         raise self._missing("potential")
 
     # ---- what may be left as it is
-    @property
-    def inner_at_start(self) -> FloatArray:
-        """`inner` of its displacement at the start. Collective."""
+    def inner_at_rest(self, u: FloatArray) -> FloatArray:
+        """`inner` in equilibrium with a displacement [m]. Collective."""
         return np.empty(0)
 
     def inner(self, u1: FloatArray) -> FloatArray:
-        """What forces of the next step depend on beside u, at the end of the step that has begun.
+        """Values at t_{n+1} that the next step starts from beside u, such as vectors within cells.
 
         Of a body with `has_inner`: as many numbers of this rank at each time, the same number for
         each of `inner_numbers`. `begin_step` takes those of t_n. Collective.
@@ -160,7 +159,7 @@ class Body:
         return np.empty(0, dtype=np.int64)
 
     def doubts(self, u: FloatArray) -> list[Any]:
-        """What may be wrong with an accepted state, as `StepWarning`, of a body with `has_inner`.
+        """What may be wrong with an accepted state, as `StepWarning`.
 
         Collective.
 
@@ -169,8 +168,13 @@ class Body:
         """
         return []
 
-    def take_inner(self, inner: FloatArray) -> None:
-        """Take `inner` of the state that `potential` and `accept` are asked of next."""
+    def take_inner(self, inner: FloatArray) -> FloatArray:
+        """Take `inner` of the state that `potential` and `accept` are asked of next.
+
+        Returns:
+            What it was before.
+        """
+        return np.empty(0)
 
     @cached_property
     def initial_displacement(self) -> FloatArray:

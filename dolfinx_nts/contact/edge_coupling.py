@@ -121,7 +121,11 @@ class EdgeCoupling:
     ) -> None:
         """Note a step, as of `Coupling.begin`; the search for nodes says whether `find` is due."""
         self._step, self._history = step, history
-        self._start = step.state.time if np.isnan(self._start) else self._start
+        if np.isnan(self._start):
+            # A run that goes on knows its contacts.
+            near = any(np.isfinite(c.gap).any() for c in step.state.contacts)
+            known = anywhere(self.contact.pair.slave.body.comm, near)
+            self._start = np.inf if known else step.state.time
         if again is None:
             self._carried, self._tried = history, _NONE[:, 0]
 

@@ -167,6 +167,7 @@ class FacetPair(ContactPair, master=Surface):
         followed: BoolArray | None = None,
     ) -> Found:
         """Search for this rank's candidates, as of `ContactPair`. Collective."""
+        self.slave_paths.forget()
         reach = self._lift + (0.0 if motion is None else motion.reach)
         every = np.ones(len(self.slave.share), dtype=bool)
         known = every if followed is None else followed

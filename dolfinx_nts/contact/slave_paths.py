@@ -36,6 +36,10 @@ class SlavePaths:
         # Slaves that slide over edges in the step, and the facets before these.
         self._sliding: IntArray = np.empty((0, 2), dtype=np.int64)
 
+    def forget(self) -> None:
+        """Forget who slides over an edge, before a search."""
+        self._sliding = self._sliding[:0]
+
     def lead(
         self,
         found: Candidates,
@@ -148,7 +152,7 @@ class SlavePaths:
         Without those that slide over an edge, which no facet holds unless they come deeper than it.
         Arguments as of `lead`, `_round_edges` and `Motion`.
         """
-        x, self._sliding = slave[self._slave.share], self._sliding[:0]
+        x = slave[self._slave.share]
         # A facet is 2 xi wide, and less along its heights; most nodes come to no edge of theirs.
         nc = self._master.facets.shape[1]
         beyond = facets.edge_excess(found.xi, nc).max(axis=1, initial=-1.0)

@@ -138,7 +138,7 @@ class StepProblem:
         self._evaluated, self._u0 = {}, self.batches.join(state.u)
         self.loads.begin(state, dt, moments)
         at_rest = self.flight.begin(state, self._u0, dt)
-        if not self.integrator.inertia:
+        if not self.integrator.inertia and again is None:
             self._follow_supports()
         lengths, first = self.lengths, self.flight.ends
         way = [a - b for a, b in zip(first, self._u0, strict=True)]
@@ -168,7 +168,7 @@ class StepProblem:
         """
         touching = set().union(*self.system.pair_bodies)
         for j, body in enumerate(self.batches.bodies):
-            if not body.driven or touching.intersection(self.batches.numbers[j]):
+            if body.rigid or not body.driven or touching.intersection(self.batches.numbers[j]):
                 continue
             u0, end, jump = self._u0[j], self.flight.ends[j], np.zeros(body.num_owned)
             jump[body.fixed] = self.flight.jumps[j]

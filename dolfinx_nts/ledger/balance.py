@@ -137,7 +137,7 @@ def measure(
         kinetic, potential, linear_momentum (3,), angular_momentum (3,).
     """
     local, known = np.zeros(8), {} if known is None else known
-    system.take_inner(state)
+    before = system.take_inner(state.inner)
     for body, u, v in _ends(system, state):
         last = known.get(body.name)
         if last is None or last[0] is not u or last[1] is not v:
@@ -147,6 +147,8 @@ def measure(
     for joint, bodies, history in joints:
         if getattr(type(joint), "potential", None) is not Joint.potential:
             local[1] += joint.potential([state.u[b] for b in bodies], history)
+    # The state may be one that is dropped.
+    system.take_inner(before)
     total = np.empty_like(local)
     system.comm.Allreduce(local, total, op=MPI.SUM)
     return {

@@ -33,6 +33,7 @@ def describe(system: System) -> dict[str, Any]:
                 "name": b.name,
                 "kind": type(b).__name__,
                 "degree": b.degree,
+                **_cells_of(b),
                 "nodes": int(nodes),
                 "mass": float(mass),
             }
@@ -54,6 +55,12 @@ def loads(system: System) -> Rows:
         {"name": body.name} | {name: of[name] for name in _LOADS if name in of}
         for body, of in zip(system.bodies, settings, strict=True)
     ]
+
+
+def _cells_of(body: Any) -> dict[str, Any]:
+    """What the cells of a body have that others do not."""
+    given = {name: body.settings.get(name) for name in ("volume", "bending")}
+    return {name: value for name, value in given.items() if value not in (None, "full", False)}
 
 
 def _settings(item: Any) -> dict[str, Any]:
@@ -114,5 +121,3 @@ def listed(sentences: list[str]) -> str:
     """The first of some differences."""
     return "; ".join(sentences[:_NAMED]) + ("; ..." if len(sentences) > _NAMED else "")
 
-
-# ---- a state in the numberings of the file

@@ -96,9 +96,9 @@ def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state:
 
 def tell_doubts(solution: Solution, state: State) -> None:
     """Warn of what bodies themselves doubt in an accepted state. Collective."""
-    for k, body in enumerate(solution.system.bodies):
-        if body.has_inner:
-            _tell(solution, state, body.doubts(state.u[k]))
+    bodies = solution.system.bodies if solution.system.has_inner else []
+    for body, u in zip(bodies, state.u, strict=False):
+        _tell(solution, state, body.doubts(u))
 
 
 def tell_overlap(solution: Solution, watch: OverlapWatch, state: State, *, last: bool) -> None:

@@ -341,7 +341,7 @@ class Stepper:
             step_warnings.tell_overlap(self.solution, self._overlap, self.state, last=last)
 
     def _accept(self, state: State) -> None:
-        self.system.take_inner(state)
+        self.system.take_inner(state.inner)
         batches = self.system.batches
         ends = (batches.join(values) for values in (state.u, state.v))
         for body, u, v in zip(batches.bodies, *ends, strict=True):

@@ -33,7 +33,8 @@ class Newton:
 
     Attributes:
         rtol: Largest residual of a block relative to the forces (or motions) of the step, > 0.
-        max_iterations: Newton iterations before a step is dropped.
+        max_iterations: Newton iterations before a step is dropped; those in which friction of
+            joints is blurred do not count, up to as many again.
         max_retries: How often a dropped step may be cut (to less than half) before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
             lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.

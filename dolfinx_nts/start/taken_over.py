@@ -73,17 +73,24 @@ def state_from(
     start = replace(
         found, time=time, u=u, contacts=tuple(contacts), joints=tuple(joints), edges=tuple(edges)
     )
-    if state.inner:
-        start = replace(
-            start, inner=system.inner_of(lambda k: state.inner[index[system.bodies[k].name]])
-        )
+    start = replace(start, inner=system.inner_of(lambda k: system.bodies[k].inner_at_rest(u[k])))
     if moving:
+        start = replace(start, inner=_moving(system, other, state, start))
         v = tuple(state.v[index[b.name]].copy() for b in system.bodies)
         a = tuple(state.a[index[b.name]].copy() for b in system.bodies) if state.a else ()
         start = replace(start, v=v, a=a)
     if not moving:
         system.check_apart(start)
     return start
+
+
+def _moving(system: System, other: System, state: State, start: State) -> tuple[FloatArray, ...]:
+    """`State.inner` of bodies that move on as they were, where they are of one kind. Collective."""
+    known = {b.name: k for k, b in enumerate(other.bodies) if b.has_inner}
+    names = [body.name for body in system.bodies]
+    return system.inner_of(
+        lambda k: state.inner[known[names[k]]] if names[k] in known else start.inner[k]
+    )
 
 
 def _check_start(body: Body, old: Body, u: FloatArray, time: float) -> None:

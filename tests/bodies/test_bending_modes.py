@@ -59,8 +59,7 @@ def test_a_strip():
 # ---- forces
 def relaxed(body, rule, u0, u1):
     """Forces between two displacements, where the body starts with the modes of the first."""
-    body.initial_displacement[:] = u0
-    inner = body.inner_at_start
+    inner = body.inner_at_rest(u0)
     body.begin_step(rule, EvaluationPoint(u0, 0.0, inner=inner))
     return body.internal(u1), inner, body.inner(u1)
 
@@ -77,23 +76,21 @@ def test_forces_are_the_slope_of_the_energy(name):
     _, u = between(body)
 
     def stored(u):
-        body.initial_displacement[:] = u
-        return energy(body, u, body.inner_at_start)
+        return energy(body, u, body.inner_at_rest(u))
 
     found, *_ = relaxed(body, EQUILIBRIUM, u, u)
     slope = differences(stored, u)
     assert np.abs(found - slope).max() < 1e-9 * np.abs(slope).max()
 
 
-@pytest.mark.parametrize("name", OF)
-@pytest.mark.parametrize("size", [1.0, 1e-6])
+@pytest.mark.parametrize(
+    ("name", "size"), [("neo-Hookean", 1.0), ("neo-Hookean", 1e-6), ("own", 1.0)]
+)
 def test_work_is_the_change_of_the_energy(name, size):
     body = body_of(distorted(), OF[name])
     u0, u1 = size * between(body)
     forces, before, after = relaxed(body, nts.EnergyMomentum(), u0, u1)
     change = energy(body, u1, after) - energy(body, u0, before)
-    if name == "own" and size < 1.0:
-        return  # a W(C) is rounded at C = 1
     assert abs(forces @ (u1 - u0) - change) < 1e-13 * energy(body, u1, after)
 
 
@@ -195,7 +192,7 @@ def test_contact_with_friction_closes_the_ledger():
 
 
 @pytest.mark.mpi
-def test_restart_and_cut_steps_go_on_from_the_modes(tmp_path_factory):
+def test_a_restart_goes_on_from_the_modes(tmp_path_factory):
     """As if never stopped: the modes of t_n belong to the state."""
     folder = str(tmp_path_factory.mktemp("modes")) if COMM.rank == 0 else None
     name = f"{COMM.bcast(folder)}/state.h5"
@@ -300,3 +297,28 @@ def test_cells_of_an_arc():
         assert low < found < 1.005
         assert ("distorted cells" in run.warnings) == told
         assert found > 0.98 or told
+
+
+@pytest.mark.parametrize("bends", [(True, False), (False, True)])
+def test_going_on_with_other_cells(bends, tmp_path):
+    """A checkpoint is refused; an equilibrium is taken over, with the modes of its displacement."""
+    held = {"bcs": [nts.Dirichlet(lambda x: x[0] < 1e-9)]}
+    load = nts.Traction(lambda x: x[0] > 2 - 1e-9, lambda t: (0.0, 0.0, 300.0 * min(t, 1.0)))
+    mesh = box((0.0, 0.0, 0.0), (2.0, 0.4, 0.2), (6, 2, 1))
+    one, other = (
+        nts.System([body_of(mesh, nts.NeoHookean(1e5, 0.3), bending=bend, traction=more, **held)])
+        for bend, more in zip(bends, ([load], []), strict=True)
+    )
+    static = nts.equilibrium(one)
+    run = nts.simulate(
+        other, nts.EnergyMomentum(), dt=5e-3, t_end=0.02, start=static, start_time=0.0
+    )
+    body = other.bodies[0]
+    expected = energy(body, static.state.u[0], body.inner_at_rest(static.state.u[0]))
+    assert run.balance["energy"][0] == pytest.approx(expected, rel=1e-12)
+    path = tmp_path / "state.h5"
+    nts.simulate(
+        one, nts.EnergyMomentum(), dt=5e-3, t_end=5e-3, checkpoint=nts.Checkpoint(path, every=1)
+    )
+    with pytest.raises(ValueError, match="bending"):
+        nts.restart(path, other)

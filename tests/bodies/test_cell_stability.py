@@ -56,7 +56,7 @@ def least_stiffness(body, stretch):
     ids=str,
 )  # fmt: skip
 def test_stretch_at_which_a_block_loses_stability(cells, options, limit):
-    """Theory 19.4 at nu = 0.3; 0.616 to 0.624 of modes, which it has in two other forms alone."""
+    """Theory 19.4 at nu = 0.3. It has two forms of modes, 0.616 and 0.624; ours is between."""
     stiffness = partial(least_stiffness, block(cells, **options))
     found = brentq(stiffness, limit - 0.03, limit + 0.03, xtol=1e-4)
     assert found == pytest.approx(limit, abs=1e-3 if limit < 0.6 else 0.01)

@@ -24,7 +24,8 @@ _WIDTH = 9
 _ROUNDS = 40
 #: Distortion of cells from which on modes do not let them bend freely.
 _DISTORTED = 0.2
-#: Least eigenvalue of C from which on cells with modes are stable (0.48 at nu = 0.4999).
+#: Least eigenvalue of C, the square of a stretch, below which cells may fold: 0.39 at nu = 0.3,
+#: 0.48 at 0.4999, with a margin.
 _FOLDS = 0.56
 #: A change of the modes that is rounding, over the modes, and of F = 1.
 _ROUNDED = 2.0 * float(np.finfo(float).eps)

@@ -83,12 +83,13 @@ class Continuum(UflBody):
             and its work counts as external.
         allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
             quadrature point, with a warning in the Solution; else such a step is cut, and the
-            run stops where that does not help. W(C) cannot see it.
+            run stops where that does not help. W(C) cannot see it. F is that of the displacement,
+            without what `bending` adds within cells.
         bending: Let hexahedra of degree 1 bend as thin parts do, without the shear that makes them
             too stiff: by three vectors within each cell, which follow from the displacement and
             from the step before (theory 19.4). For thin and stiff parts whose cells are nearly
-            parallelepipeds. A run warns of others, and of cells that are compressed to about 0.6 of
-            a length, where they may fold.
+            parallelepipeds; a run warns of others. Where a cell is compressed to 0.62 of a length
+            (nu = 0.3) to 0.69 it may fold; a run warns from 0.75 on.
         volume: "projected": W takes the change of volume of each cell in the mean, so that cells do
             not lock where the material hardly changes its volume (nu near 0.5), and bend more
             easily; for hexahedra of degree 1. "full": W at each point, as it is.
@@ -328,17 +329,18 @@ class Continuum(UflBody):
         """As of `Body`: the modes of the cells, shape (9 cells,)."""
         return self._forms.inner(u1)
 
-    def take_inner(self, inner: FloatArray) -> None:
+    def take_inner(self, inner: FloatArray) -> FloatArray:
         """As of `Body`."""
-        if self._bent is not None:
-            self._bent.x.array[: len(inner)] = inner
-
-    @property
-    def inner_at_start(self) -> FloatArray:
-        """As of `Body`: in equilibrium with the displacement that it starts in."""
-        if self._modes is None:
+        if self._bent is None:
             return np.empty(0)
-        return self._forms.inner_at_rest(self.initial_displacement)
+        values = self._bent.x.array[: len(inner)]
+        before: FloatArray = values.copy()
+        values[:] = inner
+        return before
+
+    def inner_at_rest(self, u: FloatArray) -> FloatArray:
+        """As of `Body`."""
+        return np.empty(0) if self._modes is None else self._forms.inner_at_rest(u)
 
     def doubts(self, u: FloatArray) -> list[StepWarning]:
         """As of `Body`."""
