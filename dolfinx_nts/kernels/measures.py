@@ -158,15 +158,15 @@ def _on_circle(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray)
 
 
 class Linear(NamedTuple):
-    """V = k/2 (xi - rest)^2.
+    """V = k/2 (xi - rest)^2, of numbers or of those of each element, shape (n,).
 
     Attributes:
         stiffness: k [N/m] or [N m].
         rest: Where it is free [m] or [rad].
     """
 
-    stiffness: float
-    rest: float
+    stiffness: Any
+    rest: Any
 
     def value(self, x: FloatArray) -> FloatArray:
         """V [J]."""
