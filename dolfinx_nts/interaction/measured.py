@@ -20,6 +20,7 @@ from dolfinx_nts.interaction.kinematics import Kinematics
 from dolfinx_nts.interaction.measures import HoldingLaw, Measure, Move, holds
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.interaction.points import nodal
+from dolfinx_nts.kernels import library
 from dolfinx_nts.state import State
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -105,22 +106,23 @@ class MeasuredElements(PointElements):
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> MeasuredPart:
         """Residual and tangent."""
         measure, theta, n = self.measure, self.step.integrator.taken_at, len(x)
-        rate = self.step.moments[0].rate
-        du = x - self.y0
-        first, last = (self.y0, x) if theta is None else (self.y0 + theta * du,) * 2
-        a, b = measure.vectors(first), measure.vectors(last)
-        at_a = measure.kind.value(a, self.near)
-        at_b = measure.kind.value(b, at_a) if theta is None else at_a
-        gradient = measure.kind.gradient(a, b, at_a, at_b)
+        rate, factor = self.step.moments[0].rate, self.step.factor
+        du, held = x - self.y0, holds(self.law)
         end = measure.vectors(x)
-        at_end = measure.kind.value(end, at_b)
-        size, factor = self.num_coordinates, self.step.factor
-        width = size + self.widths["constraints"]
-        residual, tangent = np.zeros((n, width)), np.zeros((n, width, width))
-        along = measure.to_nodes(gradient.mean.reshape(a.shape)).reshape(n, size)
+        if theta is None:
+            (a, b), at_a = (self._start, end), self.near
+            at_b = at_end = measure.kind.value(b, at_a)
+        else:
+            a = b = measure.vectors(self.y0 + theta * du)
+            at_a = at_b = measure.kind.value(a, self.near)
+            at_end = measure.kind.value(end, at_b)
+        gradient = measure.kind.gradient(a, b, at_a, at_b)
         share = 1.0 if theta is None else 2.0 * theta
-        status = np.empty((0, n), dtype=bool)
-        if width == size:
+        size, none = self.num_coordinates, np.zeros(0)
+        width = size + int(held)
+        residual, tangent = np.zeros((n, width)), np.zeros((n, width, width))
+        work = np.zeros(n)
+        if not held:
             start = self.step.state.time
             move = Move(
                 ends=(at_a, at_b),
@@ -131,28 +133,32 @@ class MeasuredElements(PointElements):
                 time=self.step.dt if theta is None else None,
                 when=start + (0.5 if theta is None else theta) * self.step.dt,
             )
-            pull, slope = self.law.pull(move)
-            memory = at_end[:, None]
+            both = zip(self.law.pull(move), (n, gradient.mean.shape), strict=True)
+            pull, slope = (np.broadcast_to(np.asarray(f, dtype=float), form) for f, form in both)
+            status, memory = np.empty((0, n), dtype=bool), at_end[:, None]
+            ends, of_row = none, (none,) * 4
         else:
             length, unit = measure.length, self.force_scale
             force = own["constraints"][:, 0]
             pull, slope = unit / factor * force, np.zeros_like(gradient.mean)
             row = self.law.row(length * self.since, length * at_end, force, unit / factor)
-            ends = measure.kind.gradient(end, end, at_end, at_end).end.reshape(end.shape)
-            to_end = measure.to_nodes(ends).reshape(n, size)
-            residual[:, size] = self.scale * row.value
-            tangent[:, :size, size] = unit[:, None] * along
-            tangent[:, size, :size] = (unit * row.by_end)[:, None] * to_end
-            tangent[:, size, size] = self.scale * row.by_force
+            ends = gradient.end
+            if theta is not None:
+                ends = measure.kind.gradient(end, end, at_end, at_end).end
+            of_row = unit, self.scale * row.value, unit * row.by_end, self.scale * row.by_force
             status, memory = row.status[None], np.column_stack([at_end, pull, self.since])
-        residual[:, :size] = factor * pull[:, None] * along
-        bend = share * pull[:, None, None] * gradient.change
-        inner = bend + gradient.mean[:, :, None] * slope[:, None]
-        tangent[:, :size, :size] = factor * measure.bent_at_nodes(inner)
-        work = pull * np.einsum("nz,nz->n", along, du.reshape(n, size))
-        if width > size and not self.step.integrator.inertia:
+        library.run(
+            library.load().forces_along, size // 3, a.shape[1], held, share, factor, n,
+            measure.weights, *gradient[:2], ends, pull, slope, *of_row, du, residual, tangent, work,
+        )  # fmt: skip
+        if held and not self.step.integrator.inertia:
             work = pull * (at_end - self.since)
         return MeasuredPart(residual, tangent, status, memory, work)
+
+    @cached_property
+    def _start(self) -> FloatArray:
+        """Vectors at t_n, shape (n, v, 3)."""
+        return self.measure.vectors(self.y0)
 
     def slip(self, part: MeasuredPart) -> FloatArray:
         """Change of the measure in the step as a length [m], shape (n,)."""
