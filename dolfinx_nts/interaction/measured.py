@@ -297,6 +297,22 @@ class Measured(EveryStep):
         """A start need not fit them."""
         return [None] * len(self.elements)
 
+    def motions(self, state: State) -> FloatArray:
+        """Rates of the joints' measures on this rank, (2, joints), and their sizes. Collective.
+
+        Sizes are those of what rates are sums of, whose rounding they have.
+        """
+        measure, of = self._measure, self._of
+        y, v = self._rest + nodal(measure.sides, of, state.u), nodal(measure.sides, of, state.v)
+        p = measure.vectors(y)
+        at = measure.kind.value(p, np.zeros(len(p)))
+        to_vectors = measure.kind.gradient(p, p, at, at).end.reshape(p.shape)
+        along = measure.to_nodes(to_vectors)
+        sizes = np.abs(along).sum(axis=(1, 2)) * np.abs(y).max(axis=(1, 2), initial=0.0)
+        each = np.einsum("nai,nai->n", along, v), sizes
+        count = len(self._joints)
+        return np.array([np.bincount(self._joint, one, minlength=count) for one in each])
+
     def obey(self, law: HoldingLaw) -> None:
         """Let the elements of the step obey another law."""
         self.elements = [replace(batch, law=law) for batch in self.elements]
