@@ -42,7 +42,7 @@ from dolfinx_nts.integrators import (
 from dolfinx_nts.interaction.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
 from dolfinx_nts.interaction.elements import Elements, Step
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
-from dolfinx_nts.interaction.measured import HoldingLaw, Law, Move, Row
+from dolfinx_nts.interaction.measures import HoldingLaw, Law, Move, Row
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints import (

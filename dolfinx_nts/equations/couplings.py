@@ -238,15 +238,18 @@ def _together(
     for k, (coupling, of) in enumerate(zip(each, bodies, strict=True)):
         j, *others = {batches.batch_of(b) for b in of}
         one = j < len(batches.several) and not others
-        alike = coupling.alike if type(coupling) is Constraints and one else None
-        groups.setdefault(k if alike is None else (k < declared, j, alike), []).append(k)
+        # A class of the user's own may override anything.
+        shared: Any = coupling if one and type(coupling) in (Constraints, Measured) else None
+        alike = None if shared is None else shared.alike
+        group = k if alike is None else (type(coupling), k < declared, j, alike)
+        groups.setdefault(group, []).append(k)
     out = []
     for numbers in groups.values():
         coupling = each[numbers[0]]
         if len(numbers) > 1:
             several: Any = [each[k] for k in numbers]
             j = batches.batch_of(bodies[numbers[0]][0])
-            coupling = Constraints.together(several, batches.bodies[j], batches.count + j)
+            coupling = type(several[0]).together(several, batches.bodies[j], batches.count + j)
         out.append(OfJoints(coupling, numbers))
     return out
 

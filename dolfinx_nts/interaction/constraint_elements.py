@@ -20,7 +20,7 @@ from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 _EPS = float(np.finfo(float).eps)
 #: What a limit of 0 counts as: a gap of 0 is below it, any other far above.
-_TINY = float(np.finfo(float).tiny)
+TINY = float(np.finfo(float).tiny)
 
 #: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
 #: beside their gap times their curvature. Equations that repeat others agree at the solution;
@@ -187,7 +187,7 @@ class ConstraintElements(PointElements):
     ) -> dict[str, float]:
         """Of each joint the constraint that misses most of what counts as converged."""
         limit = rtol * motion + 8 * _EPS * (rounded + np.maximum(self.extents, largest[3]))
-        size = np.abs(part.gap) / np.maximum(limit, _TINY)[:, None]
+        size = np.abs(part.gap) / np.maximum(limit, TINY)[:, None]
         worst = largest_of_joints(len(self.names), self.joint, size)
         return dict(zip(self._labels, worst.tolist(), strict=True))
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.interaction.constraint_elements import Equations
-from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.points import Points, joined_sides
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: From nodal vectors at the end of a step (n, k, 3) and the times of both its ends [s].
@@ -80,17 +80,6 @@ def joined(
         of: Numbers of their bodies.
         batch: A `BodyBatch`.
     """
-    sides = []
-    for k, body in enumerate(each[0].sides):
-        here = [rows.sides[k] for rows in each]
-        both_of = zip(here, of, strict=True)
-        nodes = [batch.numbered(bodies[k], 3 * s.nodes) // 3 for s, bodies in both_of]
-        values = [
-            np.concatenate([getattr(s, name) for s in here])
-            for name in ("weights", "reference", "fixed", "places")
-        ]
-        sides.append(Points(batch, np.concatenate(nodes).astype(body.nodes.dtype), *values))
-
     def both(name: str) -> Any:
         found = [getattr(rows, name) for rows in each]
         if isinstance(found[0], tuple):
@@ -100,5 +89,6 @@ def joined(
     others = {f.name: both(f.name) for f in fields(ConstraintRows) if f.name != "sides"}
     counts = [len(rows.joint) for rows in each]
     return ConstraintRows(
-        tuple(sides), **others | {"joint": np.repeat(np.arange(len(each)), counts)}
+        joined_sides([rows.sides for rows in each], of, batch),
+        **others | {"joint": np.repeat(np.arange(len(each)), counts)},
     )

@@ -26,7 +26,7 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import FAR_TURN, Kinematics
 from dolfinx_nts.interaction.point_elements import EveryStep
-from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.points import Points, nodal
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
@@ -156,13 +156,11 @@ class Constraints(EveryStep):
         """Ask for the scales of the elements, in dynamics once. Collective."""
         if self._scaled and step.integrator.inertia:
             return
-        known: dict[int, float] = {}
-        for of in (side for joint in self._members for side in joint._all.sides):
-            if id(of.body) not in known:
-                known[id(of.body)] = step.mean_scale(of.body)
-        least = [min(known[id(s.body)] for s in joint._all.sides) for joint in self._members]
+        least = step.least_scales([
+            [side.body for side in joint._all.sides] for joint in self._members
+        ])
         joint = self._all.joint
-        self._all, self._scaled = replace(self._all, scale=np.array(least)[joint]), True
+        self._all, self._scaled = replace(self._all, scale=least[joint]), True
 
     def rest(self, bodies: Collection[int]) -> None:
         """Leave out of the step the elements of bodies that stay where they are. Collective."""
@@ -231,11 +229,7 @@ class Constraints(EveryStep):
 
     def _nodal(self, values: Sequence[FloatArray]) -> FloatArray:
         """Values at the nodes, (n, k, 3), from those of each body of the system. Collective."""
-        found = []
-        for k, side in zip(self._of, self._rows.sides, strict=True):
-            own = values[k] if k < len(values) else side.body.joined(values)
-            found.append(side.nodal(own))
-        return np.concatenate(found, axis=1)
+        return nodal(self._rows.sides, self._of, values)
 
     def _at(self, *times: float) -> tuple[Equations, FloatArray]:
         """Equations that hold at these times, and c at each of them."""

@@ -69,6 +69,18 @@ class Step:
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 
+    def least_scales(self, each: Sequence[Sequence[Any]]) -> FloatArray:
+        """The least `mean_scale` of the bodies of each of several, shape (len(each),). Collective.
+
+        Args:
+            each: Bodies, which may be the same in many.
+        """
+        known: dict[int, float] = {}
+        for body in (body for bodies in each for body in bodies):
+            if id(body) not in known:
+                known[id(body)] = self.mean_scale(body)
+        return np.array([min(known[id(body)] for body in bodies) for bodies in each])
+
     def scale(self, surface: Any, bodies: Sequence[Any]) -> FloatArray:
         """Force per motion of a `Surface`'s points in the units of the step, (p,). Collective.
 

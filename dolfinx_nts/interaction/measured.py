@@ -1,155 +1,30 @@
-"""One measure of points under one law: springs, dampers, limits, friction, motors (section 22).
+"""Measures of points under a law: springs, dampers, limits, friction, motors (section 22).
 
-A measure c, a length or an angle, is a function of vectors that are linear in the bodies'
-coordinates, with a discrete gradient whose product with their motion is c_1 - c_0. A law says which
-force D acts along it, or holds the force as a multiplier and says which equation that satisfies.
 The work against the bodies is D (c_1 - c_0) whatever the law, and momenta are kept. Where an
 integrator has no discrete gradients, the gradient is that of the place where it takes its forces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeGuard
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
+from dolfinx_nts.interaction.constraint_elements import TINY, largest_of_joints
 from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.interaction.kinematics import Kinematics
+from dolfinx_nts.interaction.measures import HoldingLaw, Measure, Move, holds
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
-from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.kernels.measures import Gradient
-from dolfinx_nts.types import BoolArray, FloatArray, Settings
+from dolfinx_nts.interaction.points import nodal
+from dolfinx_nts.kernels import library
+from dolfinx_nts.state import State
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-
-@dataclass(frozen=True, eq=False)
-class Measure:
-    """A measure between two bodies, or a body and the ground.
-
-    Attributes:
-        kind: How it follows from vectors, such as `kernels.measures.Length`.
-        sides: Nodes that these depend on, of each body.
-        weights: Of the nodes in the vectors, shape (v, k).
-        constants: What is added, shape (v, 3).
-        length: What makes a length of it [m]: 1 of a length, that of the bodies of an angle.
-    """
-
-    kind: type[Any]
-    sides: tuple[Points, ...]
-    weights: FloatArray
-    constants: FloatArray
-    length: float = 1.0
-
-    def vectors(self, y: FloatArray) -> FloatArray:
-        """From nodal vectors (n, k, 3), shape (n, v, 3)."""
-        return self.directed(y) + self.constants
-
-    def directed(self, y: FloatArray) -> FloatArray:
-        """The same without constants, as of velocities."""
-        return np.einsum("va,nai->nvi", self.weights, y)
-
-    def nodal(self, values: Sequence[FloatArray]) -> FloatArray:
-        """Values at the nodes, (n, k, 3), from those of the bodies' coordinates. Collective."""
-        parts = [side.nodal(v) for side, v in zip(self.sides, values, strict=True)]
-        return np.concatenate(parts, axis=1)
-
-    def reference(self) -> FloatArray:
-        """Nodal vectors in the reference [m], shape (n, k, 3)."""
-        return np.concatenate([side.reference for side in self.sides], axis=1)
-
-
-class Move(NamedTuple):
-    """A measure in a step, as laws need it.
-
-    Attributes:
-        ends: Between which its gradient is taken, two of shape (n,).
-        gradient: Its gradient.
-        share: Derivative by the vectors at t_{n+1} over that by the second end, of what is
-            symmetric in both ends.
-        speed: Of the vectors where forces are taken, shape (n, 3 v).
-        rate: Its change with the vectors at t_{n+1} [1/s].
-        time: Length of the step [s] if the ends are those of the step; else None.
-        when: Time at which forces are taken [s].
-    """
-
-    ends: tuple[FloatArray, FloatArray]
-    gradient: Gradient
-    share: float
-    speed: FloatArray
-    rate: float
-    time: float | None
-    when: float
-
-
-class Law(Protocol):
-    """Which force D acts along a measure; it has no multiplier.
-
-    One that stores energy has `stored(at)`, too, the energy on this rank [J], and a D whose product
-    with the change of the measure is that of the energy. Collective.
-    """
-
-    @property
-    def settings(self) -> Settings:
-        """What it was made of, for restarts."""
-
-    def pull(self, move: Move) -> tuple[FloatArray, FloatArray]:
-        """D, shape (n,), and its derivative by the vectors at t_{n+1}, shape (n, 3 v)."""
-
-    def slopes(self, at: FloatArray) -> tuple[float, float]:
-        """Derivatives of D by the measure and by its rate on this rank. Collective."""
-
-
-class Row(NamedTuple):
-    """The equation of a multiplier, whose force and measure are lengths here; shape (n,) each.
-
-    Attributes:
-        value: [m].
-        by_end: Its derivative by the measure at t_{n+1}.
-        by_force: Its derivative by the force.
-        status: What Newton's iterations may flip.
-    """
-
-    value: FloatArray
-    by_end: FloatArray
-    by_force: FloatArray
-    status: BoolArray
-
-
-class HoldingLaw(Protocol):
-    """Which equation the multiplier of a measure satisfies."""
-
-    @property
-    def settings(self) -> Settings:
-        """What it was made of, for restarts."""
-
-    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:
-        """Its equation. One solution, whatever the unit of forces.
-
-        Args:
-            start: The measure at t_n [m], shape (n,).
-            end: At t_{n+1}.
-            force: D over `unit` [m].
-            unit: Force or torque per length of `force`.
-        """
-
-
-class Rubs(HoldingLaw, Protocol):
-    """A law that sticks and slips, with what leads Newton's method to it."""
-
-    def blurred(self, width: float) -> HoldingLaw:
-        """A law close to it, without a step between stick and slip below a width of slip [m]."""
-
-    def parted(self, held: BoolArray) -> HoldingLaw:
-        """The law of what sticks where told so, shape (n,), and slips on elsewhere."""
-
-    def unlike(self, slip: FloatArray, pull: FloatArray, width: float) -> FloatArray:
-        """What a force D misses of the blurred law, over the largest one, shape (n,).
-
-        Args:
-            slip: Change of the measure as a length [m], shape (n,).
-            pull: D, shape (n,).
-            width: Of the blurred law [m].
-        """
+_EPS = float(np.finfo(float).eps)
 
 
 class MeasuredPart(NamedTuple):
@@ -173,18 +48,22 @@ class MeasuredPart(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredElements(PointElements):
-    """One measure under one law in a step, on the rank that has it.
+    """Measures of one kind under one law in a step, on the ranks that have them.
 
     Attributes:
-        measure: The measure.
+        measure: The measures.
         law: A `Law`, or a `HoldingLaw`.
         step: The step.
         y0: Nodal vectors at t_n [m], shape (n, k, 3).
-        drift: Their velocities where forces are taken without motion [m/s], shape (n, k, 3).
+        drift: Their velocities where forces are taken without motion [m/s], shape (n, k, 3); of
+            those without multiplier only.
         near: The measure at t_n, shape (n,).
         since: The measure where the step began, which a load step does in several solutions.
         entry: Column of the ledger for the work that it takes, and its sign; "": none.
-        scale: Force per motion in the units of the step; 0 without multiplier.
+        scale: Force per motion in the units of the step, shape (n,); 0 without multiplier.
+        rest: Reference values of the nodes [m], shape (n, k, 3).
+        names: Of the joints that they are of.
+        joint: Number of each element's joint among these, shape (n,).
     """
 
     measure: Measure
@@ -195,7 +74,10 @@ class MeasuredElements(PointElements):
     near: FloatArray
     since: FloatArray
     entry: tuple[str, float]
-    scale: float = 0.0
+    scale: FloatArray
+    rest: FloatArray
+    names: Sequence[str]
+    joint: IntArray
 
     @property
     def widths(self) -> Mapping[str, int]:
@@ -208,64 +90,75 @@ class MeasuredElements(PointElements):
         return not holds(self.law)
 
     @property
-    def force_scale(self) -> float:
+    def force_scale(self) -> FloatArray:
         """Unknowns are lengths: h^2/2 D, or D in statics, over this."""
         return self.scale * self.measure.length
+
+    def reference(self) -> FloatArray:
+        """Reference values of the nodes [m], shape (n, k, 3)."""
+        return self.rest
+
+    @cached_property
+    def extents(self) -> FloatArray:
+        """Length beside the displacements whose rounding enters each [m], shape (n,)."""
+        return np.abs(self.rest).max(axis=(1, 2), initial=0.0)
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> MeasuredPart:
         """Residual and tangent."""
         measure, theta, n = self.measure, self.step.integrator.taken_at, len(x)
-        rate = self.step.moments[0].rate
-        du = x - self.y0
-        first, last = (self.y0, x) if theta is None else (self.y0 + theta * du,) * 2
-        a, b = measure.vectors(first), measure.vectors(last)
-        at_a = measure.kind.value(a, self.near)
-        at_b = measure.kind.value(b, at_a) if theta is None else at_a
-        gradient = measure.kind.gradient(a, b, at_a, at_b)
+        rate, factor = self.step.moments[0].rate, self.step.factor
+        du, held = x - self.y0, holds(self.law)
         end = measure.vectors(x)
-        at_end = measure.kind.value(end, at_b)
-        size, factor = self.num_coordinates, self.step.factor
-        width = size + self.widths["constraints"]
-        residual, tangent = np.zeros((n, width)), np.zeros((n, width, width))
-        along = np.einsum("va,nvi->nai", measure.weights, gradient.mean.reshape(a.shape))
+        if theta is None:
+            (a, b), at_a = (self._start, end), self.near
+            at_b = at_end = measure.kind.value(b, at_a)
+        else:
+            a = b = measure.vectors(self.y0 + theta * du)
+            at_a = at_b = measure.kind.value(a, self.near)
+            at_end = measure.kind.value(end, at_b)
+        gradient = measure.kind.gradient(a, b, at_a, at_b)
         share = 1.0 if theta is None else 2.0 * theta
-        status = np.empty((0, n), dtype=bool)
-        if width == size:
+        size, none = self.num_coordinates, np.zeros(0)
+        width = size + int(held)
+        residual, tangent = np.zeros((n, width)), np.zeros((n, width, width))
+        work = np.zeros(n)
+        if not held:
             start = self.step.state.time
             move = Move(
                 ends=(at_a, at_b),
                 gradient=gradient,
                 share=share,
-                speed=measure.directed(self.drift + rate * du).reshape(n, 3 * len(measure.weights)),
+                speed=measure.directed(self.drift + rate * du).reshape(gradient.mean.shape),
                 rate=rate,
                 time=self.step.dt if theta is None else None,
                 when=start + (0.5 if theta is None else theta) * self.step.dt,
             )
-            pull, slope = self.law.pull(move)
-            memory = at_end[:, None]
+            both = zip(self.law.pull(move), (n, gradient.mean.shape), strict=True)
+            pull, slope = (np.broadcast_to(np.asarray(f, dtype=float), form) for f, form in both)
+            status, memory = np.empty((0, n), dtype=bool), at_end[:, None]
+            ends, of_row = none, (none,) * 4
         else:
             length, unit = measure.length, self.force_scale
             force = own["constraints"][:, 0]
             pull, slope = unit / factor * force, np.zeros_like(gradient.mean)
             row = self.law.row(length * self.since, length * at_end, force, unit / factor)
-            ends = measure.kind.gradient(end, end, at_end, at_end).end.reshape(end.shape)
-            to_end = np.einsum("va,nvi->nai", measure.weights, ends).reshape(n, size)
-            residual[:, size] = self.scale * row.value
-            tangent[:, :size, size] = unit * along.reshape(n, size)
-            tangent[:, size, :size] = unit * row.by_end[:, None] * to_end
-            tangent[:, size, size] = self.scale * row.by_force
+            ends = gradient.end
+            if theta is not None:
+                ends = measure.kind.gradient(end, end, at_end, at_end).end
+            of_row = unit, self.scale * row.value, unit * row.by_end, self.scale * row.by_force
             status, memory = row.status[None], np.column_stack([at_end, pull, self.since])
-        residual[:, :size] = factor * (pull[:, None, None] * along).reshape(n, size)
-        bend = share * pull[:, None, None] * gradient.change
-        inner = (bend + gradient.mean[:, :, None] * slope[:, None]).reshape(n, *a.shape[1:] * 2)
-        weights = measure.weights
-        tangent[:, :size, :size] = factor * np.einsum(
-            "va,nviwj,wb->naibj", weights, inner, weights
-        ).reshape(n, size, size)
-        work = pull * np.einsum("nai,nai->n", along, du)
-        if width > size and not self.step.integrator.inertia:
+        library.run(
+            library.load().forces_along, size // 3, a.shape[1], held, share, factor, n,
+            measure.weights, *gradient[:2], ends, pull, slope, *of_row, du, residual, tangent, work,
+        )  # fmt: skip
+        if held and not self.step.integrator.inertia:
             work = pull * (at_end - self.since)
         return MeasuredPart(residual, tangent, status, memory, work)
+
+    @cached_property
+    def _start(self) -> FloatArray:
+        """Vectors at t_n, shape (n, v, 3)."""
+        return self.measure.vectors(self.y0)
 
     def slip(self, part: MeasuredPart) -> FloatArray:
         """Change of the measure in the step as a length [m], shape (n,)."""
@@ -273,9 +166,21 @@ class MeasuredElements(PointElements):
         return slip
 
     def largest(self, part: MeasuredPart) -> list[float]:
-        """The largest row of its multiplier [m], and its extent."""
-        rows = np.abs(self.rows(part, "constraints")).max(initial=0.0)
-        return [0.0, float(rows) / (self.scale or 1.0), 0.0, self.extent]
+        """Nothing: each element has limits of its own."""
+        return [0.0, 0.0, 0.0, 0.0]
+
+    def ratios(
+        self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
+    ) -> dict[str, float]:
+        """Of each joint its row over what counts as converged, if it has one."""
+        if not self.widths["constraints"]:
+            return {}
+        limit = rtol * motion + 8 * _EPS * (rounded + np.maximum(self.extents, largest[3]))
+        rows = np.abs(self.rows(part, "constraints")[:, 0]) / self.scale
+        size = rows / np.maximum(limit, TINY)
+        worst = largest_of_joints(len(self.names), self.joint, size[:, None])
+        labels = (f"{name} constraints" for name in self.names)
+        return dict(zip(labels, worst.tolist(), strict=True))
 
     def ledger(self, part: MeasuredPart, factor: float) -> dict[str, float]:
         """What leaves through it [J]."""
@@ -283,14 +188,11 @@ class MeasuredElements(PointElements):
         return {column: sign * float(part.work.sum())} if column else {}
 
     def describe(self, part: Any, flips: Any) -> tuple[float, str]:
-        """The measure's row, if it has one."""
-        weight, text = super().describe(part, flips)
-        return weight, f"{text}, flips {int(flips.sum())} times" if flips.any() else text
-
-
-def holds(law: Any) -> bool:
-    """Whether a law holds its force as a multiplier."""
-    return hasattr(law, "row")
+        """The joint whose rows are largest."""
+        size = np.nan_to_num(np.abs(part.residual).max(axis=1), nan=np.inf)
+        k = int(size.argmax())
+        text, times = f"{self.names[self.joint[k]]!r}", int(flips[:, k].sum())
+        return float(size[k]), f"{text}, flips {times} times" if times else text
 
 
 def rubs(coupling: Any) -> TypeGuard[Measured]:
@@ -304,36 +206,112 @@ class Measured(EveryStep):
     Args:
         bodies: Numbers of its bodies in the system.
         joint: Its scene's part: name, measure, law and `entry`.
+
+    Attributes:
+        law: Of all its elements.
     """
 
     def __init__(self, bodies: tuple[int, ...], joint: Any) -> None:
-        super().__init__(bodies, self._elements, lambda part: part.memory)
-        self._joint = joint
-        self._still = [np.zeros(body.num_owned) for body in joint.bodies]
+        self._set_up([joint], bodies, joint.measure, joint.law)
+        self._touched = set(bodies)
 
-    def _elements(self, step: Step, history: FloatArray) -> MeasuredElements:
-        joint, measure, of = self._joint, self._joint.measure, self.bodies[0]
-        joint.check_step(step)
-        u = [step.state.u[b] for b in of]
-        y0 = measure.reference() + measure.nodal(u)
-        near = measure.kind.value(measure.vectors(y0), history[:, 0])
-        drift = [step.moments[b].drift for b in of]
-        velocity = [none if v is None else v for v, none in zip(drift, self._still, strict=True)]
-        scale, since = 0.0, near
-        if holds(joint.law):
-            since = near if step.dt else history[:, 2]
-            scale = min(step.mean_scale(side.body) for side in measure.sides)
-            self._force = history[:, 1]
+    def _set_up(
+        self, joints: Sequence[Any], bodies: tuple[int, ...], measure: Measure, law: Any
+    ) -> None:
+        super().__init__(bodies, self._elements)
+        self._of, self._joints, self._measure, self.law = bodies, joints, measure, law
+        counts = [len(joint.measure.length) for joint in joints]
+        self._joint = np.repeat(np.arange(len(joints)), counts)
+        self._ends = np.cumsum([0, *counts]).tolist()
+        self._names = tuple(joint.name for joint in joints)
+        others = f" and {len(joints) - 1} others" if len(joints) > 1 else ""
+        self._name = f"{self._names[0]}{others}"
+        self._rest = measure.reference()
+        self._scale: FloatArray | None = None
+
+    # ---- many joints as one
+    @property
+    def alike(self) -> Hashable | None:
+        """What joints within a batch have in common that `together` takes; None: none does."""
+        (joint,), measure, law = self._joints, self._measure, self.law
+        shared = getattr(law, "alike", None)
+        if shared is None:
+            return None
+        widths = (side.nodes.shape[1] for side in measure.sides)
+        return (*widths, measure.kind, measure.weights.shape[1], type(law), shared, joint.entry)
+
+    @classmethod
+    def together(cls, each: Sequence[Measured], batch: Any, number: int) -> Measured:
+        """One for joints that are `alike`, as of `Constraints.together`."""
+        joints, of = [one._joints[0] for one in each], [one._of for one in each]
+        measure = Measure.joined([joint.measure for joint in joints], of, batch)
+        counts = [len(joint.measure.length) for joint in joints]
+        law = type(joints[0].law).together([joint.law for joint in joints], counts)
+        new = cls.__new__(cls)
+        new._set_up(joints, (number,) * len(measure.sides), measure, law)
+        new._touched = set().union(*of)
+        return new
+
+    # ---- in a step
+    def _elements(self, step: Step, history: Any) -> MeasuredElements:
+        measure, of = self._measure, self._of
+        for joint in self._joints:
+            joint.check_step(step)
+        memory = np.concatenate(history) if len(self._joints) > 1 else history
+        y0 = self._rest + nodal(measure.sides, of, step.state.u)
+        near = measure.kind.value(measure.vectors(y0), memory[:, 0])
+        drift, scale, since = np.empty(0), np.zeros(len(near)), near
+        if holds(self.law):
+            since = near if step.dt else memory[:, 2]
+            scale, self._force = self._scales(step), memory[:, 1]
+        else:
+            moved = zip(step.moments, step.state.v, strict=True)
+            drift = nodal(measure.sides, of, [
+                np.zeros_like(v) if m.drift is None else m.drift for m, v in moved
+            ])  # fmt: skip
         return MeasuredElements(
-            name=joint.name, sides=measure.sides, measure=measure, law=joint.law, step=step, y0=y0,
-            drift=measure.nodal(velocity), near=near, since=since, entry=joint.entry,
-            scale=scale,
+            name=self._name, sides=measure.sides, measure=measure, law=self.law, step=step, y0=y0,
+            drift=drift, near=near, since=since, entry=self._joints[0].entry, scale=scale,
+            rest=self._rest, names=self._names, joint=self._joint,
         )  # fmt: skip
 
-    @property
-    def law(self) -> Any:
-        """That of the joint."""
-        return self._joint.law
+    def _scales(self, step: Step) -> FloatArray:
+        """As of `MeasuredElements`, in dynamics asked for once. Collective."""
+        if self._scale is None or not step.integrator.inertia:
+            each = [[side.body for side in joint.measure.sides] for joint in self._joints]
+            self._scale = step.least_scales(each)[self._joint]
+        return self._scale
+
+    def history(self, parts: Sequence[MeasuredPart]) -> Any:
+        """The memory of an accepted step: of a joint alone an array, of many one of each."""
+        (part,) = parts
+        if len(self._joints) == 1:
+            return part.memory
+        return [part.memory[a:b] for a, b in pairwise(self._ends)]
+
+    def touched(self) -> set[int]:
+        """All bodies."""
+        return self._touched
+
+    def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
+        """A start need not fit them."""
+        return [None] * len(self.elements)
+
+    def motions(self, state: State) -> FloatArray:
+        """Rates of the joints' measures on this rank, (2, joints), and their sizes. Collective.
+
+        Sizes are those of what rates are sums of, whose rounding they have.
+        """
+        measure, of = self._measure, self._of
+        y, v = self._rest + nodal(measure.sides, of, state.u), nodal(measure.sides, of, state.v)
+        p = measure.vectors(y)
+        at = measure.kind.value(p, np.zeros(len(p)))
+        to_vectors = measure.kind.gradient(p, p, at, at).end.reshape(p.shape)
+        along = measure.to_nodes(to_vectors)
+        sizes = np.abs(along).sum(axis=(1, 2)) * np.abs(y).max(axis=(1, 2), initial=0.0)
+        each = np.einsum("nai,nai->n", along, v), sizes
+        count = len(self._joints)
+        return np.array([np.bincount(self._joint, one, minlength=count) for one in each])
 
     def obey(self, law: HoldingLaw) -> None:
         """Let the elements of the step obey another law."""

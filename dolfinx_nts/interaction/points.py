@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -151,6 +152,45 @@ class Points:
     def are_nodes(self) -> bool:
         """Whether each point is one node."""
         return self.weights.shape[1] == 1 and bool((self.weights == 1.0).all())
+
+
+def nodal(
+    sides: Sequence[Points], of: Sequence[int], values: Sequence[FloatArray]
+) -> FloatArray:
+    """Values at the nodes of all sides, (n, k, 3), from those of each body. Collective.
+
+    Args:
+        sides: Of bodies, or of batches of bodies.
+        of: Numbers of these in the system, see `Batches.batch_of`.
+        values: At this rank's owned coordinates of each body of the system.
+    """
+    found = []
+    for k, side in zip(of, sides, strict=True):
+        own = values[k] if k < len(values) else side.body.joined(values)
+        found.append(side.nodal(own))
+    return np.concatenate(found, axis=1)
+
+
+def joined_sides(
+    each: Sequence[Sequence[Points]], of: Sequence[tuple[int, ...]], batch: Any
+) -> tuple[Points, ...]:
+    """The sides of several elements as those of one batch that has their bodies.
+
+    Args:
+        each: Sides of some elements.
+        of: Numbers of their bodies.
+        batch: A `BodyBatch`.
+    """
+    sides = []
+    for k, here in enumerate(zip(*each, strict=True)):
+        both_of = zip(here, of, strict=True)
+        nodes = [batch.numbered(bodies[k], 3 * s.nodes) // 3 for s, bodies in both_of]
+        values = [
+            np.concatenate([getattr(s, name) for s in here])
+            for name in ("weights", "reference", "fixed", "places")
+        ]
+        sides.append(Points(batch, np.concatenate(nodes).astype(here[0].nodes.dtype), *values))
+    return tuple(sides)
 
 
 def in_mesh(body: Any, x: FloatArray, name: str) -> Points:

@@ -10,10 +10,10 @@ import numpy as np
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.coupling import Joint, Slopes
-from dolfinx_nts.interaction.measured import Measure
+from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import ROUNDED, Motion, points_of
-from dolfinx_nts.joints.cable_elements import CableCoupling, Memory, to_nodes
+from dolfinx_nts.joints.cable_elements import CableCoupling, Memory
 from dolfinx_nts.kernels.cable import Lengths, Stretched
 from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.types import FloatArray, Vector
@@ -143,7 +143,9 @@ class Cable(Joint):
             weights[mine, first : (first := first + side.nodes.shape[1])] = own
             constants[mine] = 0.0
         sides = tuple(side.select(slice(self._here)) for _, side, _ in found)
-        return Measure(Lengths, sides, np.diff(weights, axis=0), np.diff(constants, axis=0))
+        n = self._here
+        between, apart = (np.diff(given, axis=0)[None][:n] for given in (weights, constants))
+        return Measure(Lengths, sides, between, apart, np.ones(n))
 
     def _take_length(self, length: Any) -> None:
         """Set its length, which a winch changes. Collective."""
@@ -193,7 +195,7 @@ class Cable(Joint):
         if state is None or not numbers:
             raise ValueError(f"run={run!r}: has no state yet, or another system than that of "
                              f"{self.name!r}; pass a run of its own")  # fmt: skip
-        parts = len(self.measure.weights)
+        parts = self.measure.weights.shape[1]
         own = Memory.of(state.joints[numbers[0]], parts).tension.sum(axis=0)
         total: FloatArray = self.comm.allreduce(own)
         return total
@@ -205,7 +207,7 @@ class Cable(Joint):
 
     def start(self) -> FloatArray:
         """No tension."""
-        parts, length = len(self.measure.weights), self.length_at(0.0)
+        parts, length = self.measure.weights.shape[1], self.length_at(0.0)
         row = [*np.zeros(parts), self._path, length, length, *np.zeros(len(self.levels))]
         return np.tile(row, (self._here, 1))
 
@@ -214,7 +216,7 @@ class Cable(Joint):
         if self.axial_stiffness is None:
             return 0.0
         path = Lengths.value(self._vectors(u), history)
-        free = Memory.of(history, len(self.measure.weights)).length[:, 0]
+        free = Memory.of(history, self.measure.weights.shape[1]).length[:, 0]
         return float(Stretched(self.axial_stiffness, free).value(path).sum())
 
     def slopes(self, u: Sequence[FloatArray], history: FloatArray) -> Slopes | None:
@@ -224,11 +226,11 @@ class Cable(Joint):
         measure, p = self.measure, self._vectors(u)
         path = Lengths.value(p, history)
         mean = Lengths.gradient(p, p, path, path).mean.reshape(p.shape)
-        along, gradients, first = to_nodes(measure, mean), [], 0
+        along, gradients, first = measure.to_nodes(mean), [], 0
         for side in measure.sides:
             here = slice(first, first := first + side.nodes.shape[1])
             gradients.append(side.gathered(along[:, here]))
-        free = Memory.of(history, len(measure.weights)).length[:, 0]
+        free = Memory.of(history, measure.weights.shape[1]).length[:, 0]
         _, change = Stretched(self.axial_stiffness, free).quotient(path, path)
         return Slopes(gradients, 2.0 * float(self.comm.allreduce(change.sum())))
 

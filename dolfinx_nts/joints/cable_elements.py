@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.interaction.measured import Measure
+from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.kernels.cable import Lengths, Stretched, turns
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -139,7 +139,7 @@ class CableElements(PointElements):
     @cached_property
     def sums(self) -> FloatArray:
         """Derivatives of T_k by the multipliers, and of c_j by l_k, shape (v, multipliers)."""
-        found = np.arange(len(self.measure.weights))[:, None] >= self.levels
+        found = np.arange(self.measure.weights.shape[1])[:, None] >= self.levels
         found[:, :1] = True
         return found.astype(float)
 
@@ -160,7 +160,7 @@ class CableElements(PointElements):
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> CablePart:
         """Residual and tangent."""
         measure, theta, n, sums = self.measure, self.taken_at, len(x), self.sums
-        factor, size, v = self.step.factor, self.num_coordinates, len(measure.weights)
+        factor, size, v = self.step.factor, self.num_coordinates, measure.weights.shape[1]
         force = own["constraints"]
         first, last = self.y0, x
         if theta is not None:
@@ -188,8 +188,8 @@ class CableElements(PointElements):
             tension, more = pulls @ sums.T, np.zeros((n, 1, 1))
             told = self._told(tension, start, end)
             rows = self._rows(force, path, start, end)
-            along = np.einsum("va,nvi,vm->naim", measure.weights, mean, sums)
-            to_end = np.einsum("nmvi,va->nmai", rows.by_end, measure.weights)
+            along = np.einsum("nva,nvi,vm->naim", measure.weights, mean, sums)
+            to_end = np.einsum("nmvi,nva->nmai", rows.by_end, measure.weights)
             residual[:, size:] = unit * rows.value
             tangent[:, :size, size:] = unit * along.reshape(n, size, width - size)
             tangent[:, size:, :size] = unit * to_end.reshape(n, width - size, size)
@@ -200,11 +200,9 @@ class CableElements(PointElements):
                 way = np.einsum("nvi,nvi->nv", mean, end - start) @ sums
             works = self._works(pulls, told, way)
         forces = tension[:, :, None] * mean
-        residual[:, :size] = factor * to_nodes(measure, forces).reshape(n, size)
-        inner = (np.repeat(tension, 3, axis=1)[:, :, None] * bend + more).reshape(n, v, 3, v, 3)
-        tangent[:, :size, :size] = factor * np.einsum(
-            "va,nviwj,wb->naibj", measure.weights, inner, measure.weights, optimize=True
-        ).reshape(n, size, size)
+        residual[:, :size] = factor * measure.to_nodes(forces).reshape(n, size)
+        inner = (np.repeat(tension, 3, axis=1)[:, :, None] * bend + more)
+        tangent[:, :size, :size] = factor * measure.bent_at_nodes(inner)
         length = np.full((n, 1), self.lengths[-1])
         memory = Memory(told, paths[:, None], length, self.begun[:, None], self.since)
         return CablePart(residual, tangent, status, np.hstack(memory), works)
@@ -323,11 +321,6 @@ class CableElements(PointElements):
         return weight, f"{text}, flips {int(flips.sum())} times" if flips.any() else text
 
 
-def to_nodes(measure: Measure, values: FloatArray) -> FloatArray:
-    """Sums at the nodes, (n, k, 3), of what acts on a measure's vectors, (n, v, 3)."""
-    return np.einsum("va,nvi->nai", measure.weights, values)
-
-
 def winch_work(
     stiffness: float, paths: tuple[FloatArray, FloatArray], lengths: tuple[Any, Any]
 ) -> float:
@@ -364,7 +357,7 @@ class CableCoupling(EveryStep):
         # Forces that are taken between both ends have the length of their time.
         parts = (0.0, 0.5 if rule.taken_at is None else rule.taken_at, 1.0)
         lengths = [cable.length_at(start + part * step.dt) for part in parts]
-        old = Memory.of(history, len(measure.weights))
+        old = Memory.of(history, measure.weights.shape[1])
         self._old = old
         begun, since = old.begun[:, 0], old.since
         if step.dt:
@@ -391,7 +384,7 @@ class CableCoupling(EveryStep):
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float:
         """Work of the winch, of the mean of the tensions at both ends [J]."""
         cable = self._cable
-        old, new = (Memory.of(m, len(cable.measure.weights)) for m in (before, after))
+        old, new = (Memory.of(m, cable.measure.weights.shape[1]) for m in (before, after))
         lengths = cable.length_at(start), cable.length_at(end)
         if cable.axial_stiffness is not None:
             return winch_work(cable.axial_stiffness, (old.path, new.path), lengths)

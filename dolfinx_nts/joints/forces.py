@@ -7,7 +7,7 @@ d (c_1 - c_0)^2/h.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from dolfinx_nts.interaction.coupling import Slopes
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.interaction.measured import Measure, Measured, Move, holds
+from dolfinx_nts.interaction.measured import Measured
+from dolfinx_nts.interaction.measures import Measure, Move, columns, holds
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import OfTwo, points_of, require_directions, triad
 from dolfinx_nts.kernels import measures as kernel
@@ -61,8 +62,9 @@ class AlongMeasure(OfTwo):
     ) -> None:  # fmt: skip
         """Set the measure: vectors of all nodes' weights (k,) and a constant (3,) each."""
         here = tuple(side.select(slice(self._here)) for side in sides)
-        weights, constants = (np.array(part) for part in zip(*rows, strict=True))
-        self.measure = Measure(kind, here, weights, constants, length)
+        n = self._here
+        weights, constants = (np.array(part)[None][:n] for part in zip(*rows, strict=True))
+        self.measure = Measure(kind, here, weights, constants, np.full(n, length))
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -104,7 +106,7 @@ class AlongMeasure(OfTwo):
         measure, (y, at) = self.measure, self._at(u, history)
         p = measure.vectors(y)
         mean = measure.kind.gradient(p, p, at, at).mean.reshape(p.shape)
-        along = np.einsum("va,nvi->nai", measure.weights, mean)
+        along = measure.to_nodes(mean)
         gradients, first = [], 0
         for side in measure.sides:
             here = slice(first, first := first + side.nodes.shape[1])
@@ -236,6 +238,17 @@ class Stiff:
         """Those of a linear one; functions cannot be compared."""
         return self._energy._asdict() if isinstance(self._energy, kernel.Linear) else {}
 
+    @property
+    def alike(self) -> type[kernel.Linear] | None:
+        """Linear ones are; functions are asked one by one."""
+        return kernel.Linear if isinstance(self._energy, kernel.Linear) else None
+
+    @classmethod
+    def together(cls, laws: Sequence[Stiff], counts: Sequence[int]) -> Stiff:
+        """One with arrays of numbers."""
+        stiffness, rest = columns([law._energy for law in laws], counts)
+        return cls(kernel.Linear(stiffness, rest), laws[0]._ask)
+
     def stored(self, at: FloatArray) -> float:
         """V [J] on this rank. Collective."""
         return float(self._ask(self._energy.value, at).sum())
@@ -255,10 +268,20 @@ class Viscous(NamedTuple):
     """Force of a damper.
 
     Attributes:
-        damping: c [N s/m] or [N m s].
+        damping: c [N s/m] or [N m s], a number or of each element, shape (n,).
     """
 
-    damping: float
+    damping: Any
+
+    @property
+    def alike(self) -> Hashable:
+        """All are."""
+        return ()
+
+    @classmethod
+    def together(cls, laws: Sequence[Viscous], counts: Sequence[int]) -> Viscous:
+        """One with an array of c."""
+        return cls(*columns(laws, counts))
 
     @property
     def settings(self) -> dict[str, float]:
@@ -270,10 +293,12 @@ class Viscous(NamedTuple):
         gradient = move.gradient
         if move.time is not None:
             c = self.damping / move.time
-            return c * (move.ends[1] - move.ends[0]), c * gradient.end
+            change = move.ends[1] - move.ends[0]
+            return c * change, np.reshape(c, (-1, 1)) * gradient.end
         rate = np.einsum("nz,nz->n", gradient.mean, move.speed)
         bend = move.share * np.einsum("nz,nzy->ny", move.speed, gradient.change)
-        return self.damping * rate, self.damping * (bend + move.rate * gradient.mean)
+        by_end = bend + move.rate * gradient.mean
+        return self.damping * rate, np.reshape(self.damping, (-1, 1)) * by_end
 
     def slopes(self, at: FloatArray) -> tuple[float, float]:
         """None and c."""

@@ -5,13 +5,13 @@ A joint knows none of them. Each is a joint of its own beside it, with its own c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.interaction.measured import Move, Row
+from dolfinx_nts.interaction.measures import Move, Row, columns
 from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.types import BoolArray, FloatArray
@@ -55,21 +55,32 @@ class Bound(NamedTuple):
     """The measure rests while |D| <= bound, else D = bound against its motion.
 
     Attributes:
-        bound: Of D.
+        bound: Of D, a number or of each element, shape (n,).
         width: As of `Rubs.blurred`; 0: the law itself.
         held: As of `Rubs.parted`; None: as the law says.
     """
 
-    bound: float
+    bound: Any
     width: float = 0.0
     held: BoolArray | None = None
+
+    @property
+    def alike(self) -> Hashable:
+        """All are."""
+        return ()
+
+    @classmethod
+    def together(cls, laws: Sequence[Bound], counts: Sequence[int]) -> Bound:
+        """One with an array of bounds."""
+        (bound,) = columns([law[:1] for law in laws], counts)
+        return cls(bound)
 
     @property
     def settings(self) -> Mapping[str, Any]:
         """The bound."""
         return {"bound": self.bound}
 
-    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:
+    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: FloatArray) -> Row:
         """Stick c_1 = c_0, or D = bound sign(c_1 - c_0), by the trial D + c_1 - c_0."""
         slip, most = end - start, self.bound / unit
         trial = slip if self.held is not None else force + slip
@@ -98,17 +109,27 @@ class Bound(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """low <= c <= high, by a force that pushes only [m]."""
+    """low <= c <= high, by a force that pushes only [m]; numbers or of each element, shape (n,)."""
 
-    low: float
-    high: float
+    low: Any
+    high: Any
+
+    @property
+    def alike(self) -> Hashable:
+        """All are."""
+        return ()
+
+    @classmethod
+    def together(cls, laws: Sequence[Limits], counts: Sequence[int]) -> Limits:
+        """One with arrays of limits."""
+        return cls(*columns(laws, counts))
 
     @property
     def settings(self) -> Mapping[str, Any]:
         """Both."""
         return self._asdict()
 
-    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:
+    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: FloatArray) -> Row:
         """c_1 = high where D + c_1 - high > 0, c_1 = low where D + c_1 - low < 0, else D = 0."""
         high, low = force + end - self.high > 0.0, force + end - self.low < 0.0
         held = high | low

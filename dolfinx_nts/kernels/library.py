@@ -22,6 +22,7 @@ import numpy as np
 _NAMES = (
     *("facets.h", "nts_element.h", "facets.c", "nts_element.c", "surface_points.c"),
     *("segments.c", "contact_law.c", "edges.c", "constraints.c", "node_sums.c"),
+    "measures.c",
 )
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
@@ -135,6 +136,8 @@ _KERNELS = {
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
     "constraints": (_INT, _INT, _REAL, _LONG, *(_ARRAY,) * 12),
+    "gradients": (_INT, _LONG, *(_ARRAY,) * 7),
+    "forces_along": (*(_INT,) * 3, _REAL, _REAL, _LONG, *(_ARRAY,) * 14),
     "node_sums": (_INT, _INT, _LONG, *(_ARRAY,) * 5),
 }
 

@@ -13,13 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.discrete_gradient import resolved_mean
 from dolfinx_nts.types import Array, FloatArray
 
 #: Length [m] that keeps 0/0 away where a length is 0; far below any other.
 _NO_LENGTH = 1e-100
-#: Half a turn below which x/sin x is differentiated by its series.
-_SMALL_TURN = 1e-3
 #: Imaginary part of an argument over its size: its square is no number beside 1.
 _IMAGINARY = 1e-30
 #: Part of the argument by which forces are compared for their slope.
@@ -57,10 +56,7 @@ class Length:
     @staticmethod
     def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
         """(r_a + r_b)/(l_a + l_b), from r and l at both ends."""
-        both = (at_a + at_b)[:, None]
-        mean, end = (a + b)[:, 0] / both, b[:, 0] / at_b[:, None]
-        change = (np.eye(3) - mean[:, :, None] * end[:, None]) / both[:, :, None]
-        return Gradient(mean, change, end)
+        return _gradient(a, b, at_a, at_b)
 
 
 class Along:
@@ -80,11 +76,7 @@ class Along:
     @staticmethod
     def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
         """That in the middle: it is quadratic."""
-        n = len(a)
-        change = np.zeros((n, 2, 3, 2, 3))
-        change[:, 0, :, 1] = change[:, 1, :, 0] = 0.5 * np.eye(3)
-        mean, end = (p[:, ::-1].reshape(n, 6) for p in (0.5 * (a + b), b))
-        return Gradient(mean, change.reshape(n, 6, 6), end)
+        return _gradient(a, b, at_a, at_b)
 
 
 class Angle:
@@ -110,16 +102,15 @@ class Angle:
     @staticmethod
     def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
         """That of phi by z, with the gradient of z in the middle: z is quadratic."""
-        mean, change, end = _on_circle(_plane(a), _plane(b), at_a, at_b)
-        middle, last = _slopes(0.5 * (a + b)), _slopes(b)
-        bent = np.zeros((len(a), 3, 3, 3, 3))
-        for k in range(2):
-            bent[:, k, :, 2] = bent[:, 2, :, k] = 0.5 * mean[:, k, None, None] * np.eye(3)
-        return Gradient(
-            np.einsum("nk,nkz->nz", mean, middle),
-            bent.reshape(-1, 9, 9) + np.einsum("nkz,nkl,nly->nzy", middle, change, last),
-            np.einsum("nk,nkz->nz", end, last),
-        )
+        return _gradient(a, b, at_a, at_b)
+
+
+def _gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
+    """Of the kind that has so many vectors, (n, v, 3), see `measures.c`."""
+    n, size = len(a), 3 * a.shape[1]
+    found = Gradient(np.empty((n, size)), np.empty((n, size, size)), np.empty((n, size)))
+    library.run(library.load().gradients, a.shape[1], n, a, b, at_a, at_b, *found)
+    return found
 
 
 def _plane(p: FloatArray) -> FloatArray:
@@ -127,46 +118,16 @@ def _plane(p: FloatArray) -> FloatArray:
     return np.einsum("nki,ni->nk", p[:, :2], p[:, 2])
 
 
-def _slopes(p: FloatArray) -> FloatArray:
-    """Derivative of z by the vectors' components, shape (n, 2, 9)."""
-    out = np.zeros((len(p), 2, 3, 3))
-    out[:, 0, 0] = out[:, 1, 1] = p[:, 2]
-    out[:, :, 2] = p[:, :2]
-    return out.reshape(-1, 2, 9)
-
-
-def _on_circle(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
-    """Discrete gradient of phi by z along the circle at half the turn, from z at both ends (n, 2).
-
-    Half the turn over its sine and over the mean of rho: z_b - z_a has this component there.
-    """
-    half, middle = 0.5 * (at_b - at_a), 0.5 * (at_a + at_b)
-    rho_a, rho_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
-    both = 0.5 * (rho_a + rho_b)
-    factor = 1.0 / (np.sinc(half / np.pi) * both)
-    along = np.column_stack([-np.sin(middle), np.cos(middle)])
-    out = np.column_stack([np.cos(middle), np.sin(middle)])
-    small = np.abs(half) < _SMALL_TURN
-    x = np.where(small, 1.0, half)
-    turn = np.where(small, half / 3.0 + half**3 / 45.0, 1.0 / x - 1.0 / np.tan(x))
-    mean, radial = factor[:, None] * along, b / rho_b[:, None]
-    end = np.column_stack([-radial[:, 1], radial[:, 0]]) / rho_b[:, None]
-    by_angle = 0.5 * (turn[:, None] * mean - factor[:, None] * out)
-    by_size = -0.5 / both[:, None] * mean
-    change = by_angle[:, :, None] * end[:, None] + by_size[:, :, None] * radial[:, None]
-    return Gradient(mean, change, end)
-
-
 class Linear(NamedTuple):
-    """V = k/2 (xi - rest)^2.
+    """V = k/2 (xi - rest)^2, of numbers or of those of each element, shape (n,).
 
     Attributes:
         stiffness: k [N/m] or [N m].
         rest: Where it is free [m] or [rad].
     """
 
-    stiffness: float
-    rest: float
+    stiffness: Any
+    rest: Any
 
     def value(self, x: FloatArray) -> FloatArray:
         """V [J]."""

@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.coupling import Slopes
 from dolfinx_nts.interaction.kinematics import has_constraints
+from dolfinx_nts.interaction.measured import Measured
 from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.start import consistent
 from dolfinx_nts.state import State
@@ -152,11 +153,12 @@ class DamperWatch:
             return None
         if self._rates is None:
             self._rates = self._begin()
+        ways, sizes = self._motions(state)
         for k, rates in self._rates.items():
-            slopes, rate, size = self._motion(k, state)
-            rates[:] = [*rates[-2:], rate]
-            if not (_alternate(rates) and max(map(abs, rates)) * problem.dt > _NOISE * size):
+            rates[:] = [*rates[-2:], ways[k]]
+            if not (_alternate(rates) and max(map(abs, rates)) * problem.dt > _NOISE * sizes[k]):
                 continue
+            slopes = self._slopes(k, state)
             gradient = [np.zeros(body.num_owned) for body in problem.system.bodies]
             for body, g in zip(problem.system.joint_bodies[k], slopes.gradients, strict=True):
                 gradient[body] = g
@@ -173,27 +175,40 @@ class DamperWatch:
 
     def _begin(self) -> dict[int, list[float]]:
         """Rates at t_n of the dampers between rigid bodies, by their numbers. Collective."""
-        problem, rates = self._problem, {}
+        problem, found = self._problem, []
         system, state = problem.system, problem.state
-        for k, (joint, of) in enumerate(zip(system.joints, system.joint_bodies, strict=True)):
-            slopes = joint.slopes([state.u[b] for b in of], state.joints[k])
+        for k, of in enumerate(system.joint_bodies):
+            slopes = self._slopes(k, state)
             if slopes is None or not slopes.damping > 0.0:
                 continue
             if all(system.bodies[b].rigid for b in _joined(problem, of)):
-                rates[k] = [self._motion(k, state)[1]]
-        return rates
+                found.append(k)
+        self._rates = {k: [] for k in found}
+        ways, _ = self._motions(state)
+        return {k: [ways[k]] for k in found}
 
-    def _motion(self, k: int, state: State) -> tuple[Slopes, float, float]:
-        """Slopes of a damper, the rate of its coordinate, and what that may be at most."""
+    def _slopes(self, k: int, state: State) -> Any:
+        """Of joint k; None: it holds. Collective."""
         system = self._problem.system
-        of = system.joint_bodies[k]
-        slopes = system.joints[k].slopes([state.u[b] for b in of], state.joints[k])
-        local = np.zeros(2)
-        for b, g in zip(of, slopes.gradients, strict=True):
-            place = np.abs(system.bodies[b].reference + state.u[b]).max(initial=0.0)
-            local += [g @ state.v[b], np.abs(g).sum() * place]
-        rate, size = global_sum(system.comm, local).tolist()
-        return slopes, rate, size
+        u = [state.u[b] for b in system.joint_bodies[k]]
+        return system.joints[k].slopes(u, state.joints[k])
+
+    def _motions(self, state: State) -> list[list[float]]:
+        """Rates of dampers' coordinates, and what these may be at most, by joint. Collective."""
+        system, watched = self._problem.system, self._rates or {}
+        local = np.zeros((2, len(system.joints)))
+        for coupling, numbers in self._problem.couplings.joints:
+            if watched.keys().isdisjoint(numbers):
+                continue
+            if isinstance(coupling, Measured):
+                local[:, numbers] = coupling.motions(state)
+                continue
+            for k in sorted(watched.keys() & set(numbers)):
+                gradients = self._slopes(k, state).gradients
+                for b, g in zip(system.joint_bodies[k], gradients, strict=True):
+                    place = np.abs(system.bodies[b].reference + state.u[b]).max(initial=0.0)
+                    local[:, k] += [g @ state.v[b], np.abs(g).sum() * place]
+        return global_sum(system.comm, local).tolist()
 
 
 def _alternate(rates: list[float]) -> bool:

@@ -8,6 +8,7 @@ from integrators import ACCELERATED, MID_STEP
 from scipy.optimize import brentq, lsq_linear
 
 import dolfinx_nts as nts
+from dolfinx_nts.interaction.measured import Measured
 
 COMM = MPI.COMM_WORLD
 G = 9.81
@@ -340,3 +341,72 @@ def test_wrong_laws(laws, error, text):
         nts.Thrust(body, None, [(0, 0, 0), (0, 0, 0)], force=lambda t, x, rate: 1.0)
     with pytest.raises(ValueError, match=r"turning_limits=\(1, 2\): pass the smallest"):
         nts.Cylindrical(body, None, point=(0, 0, 0), axis=(0, 0, 1), turning_limits=(1, 2))
+
+
+def chain_with_laws(holding):
+    """Links between which laws of many numbers act, and one of another kind."""
+    turning = [np.array([0.1, 0.3 * k, -0.2]) for k in range(6)]
+    links = [
+        nts.RigidBody.from_inertia(
+            1.0 + 0.1 * k, (0.01, 0.1, 0.1), centre=(k + 0.5, 0, 0), name=f"link {k}",
+            angular_velocity=turning[k],
+        )
+        for k in range(6)
+    ]  # fmt: skip
+    hinges, more = [], []
+    for k, (a, b) in enumerate(zip(links, [None, *links], strict=False)):
+        laws = {}
+        if holding:
+            laws = {"friction": nts.JointFriction(bound=0.3 + 0.4 * k)}
+            if k != 3:
+                laws["limits"] = (-0.05 - 0.01 * k, 0.06)
+        hinges.append(
+            nts.Revolute(a, b, point=(k, 0, 0), axis=(0, 1, 0.1 * k), name=f"hinge {k}", **laws)
+        )
+        options = {"stiffness": 5.0 + k, "angle": 0.1 * k, "name": f"torsion spring {k}"}
+        more.append(nts.TorsionSpring.about(hinges[-1], **options))
+        more.append(nts.TorsionDamper.about(hinges[-1], damping=0.1 + k, name=f"damper {k}"))
+        ends = (k + 0.5, 0, 0.3), (k - 0.4, 0.1 * k, 0)
+        more.append(nts.Spring(a, b, ends, stiffness=20.0 + k, name=f"spring {k}"))
+    return nts.System(links, joints=[*hinges, *more], gravity=(0, 0, -G))
+
+
+@pytest.mark.parametrize("rule", [*MID_STEP.values(), *ACCELERATED.values()])
+def test_laws_that_are_alike_do_what_each_does_alone(rule, monkeypatch):
+    """Reactions by name, columns of the ledger and what each joint remembers."""
+    holding, runs = rule in MID_STEP.values(), []
+    for alone in (False, True):
+        if alone:
+            monkeypatch.setattr(Measured, "alike", None)
+        system = chain_with_laws(holding)
+        exact = nts.Newton(rtol=1e-14)
+        stepper = nts.Stepper(system, rule, project_start=True, newton=exact)
+        for _ in range(20):
+            stepper.advance(0.01)
+        joints = [coupling for coupling, _ in stepper.problem.couplings.joints]
+        count = sum(isinstance(coupling, Measured) for coupling in joints)
+        runs.append((stepper.solution.balance, stepper.state, count))
+        stepper.close()
+    (one, state, together), (two, right, count) = runs
+    assert together < count == len(system.declared_joints) - 6
+    for name in one.keys() - {"newton_iterations", "ledger_residual"}:
+        a, b = np.asarray(one[name], dtype=float), np.asarray(two[name], dtype=float)
+        known = np.isfinite(b)
+        size = np.abs(b[known]).max(initial=1.0)
+        assert np.array_equal(np.isfinite(a), known), name
+        # Velocities and forces have the rounding of positions over h and its square.
+        assert np.abs(a[known] - b[known]).max(initial=0.0) <= 1e-10 * size, name
+    for a, b in zip(state.u, right.u, strict=True):
+        assert np.abs(a - b).max(initial=0.0) <= 1e-12
+    if holding:  # some slip, some rest on a limit
+        both = zip(system.joints, state.joints, strict=True)
+        acts = [own[:, 1].any() for joint, own in both if joint.name.endswith("limits")]
+        assert one["friction_dissipation"][-1] > 0.0
+        assert COMM.allreduce(sum(acts)) > 0
+    # Forces of laws are torques of the same size; Newmark's carry their rounding on.
+    most = max(float(np.abs(b).max(initial=0.0)) for b in right.joints if b is not None)
+    most = COMM.allreduce(most, op=MPI.MAX)
+    for a, b in zip(state.joints, right.joints, strict=True):
+        if b is not None:
+            assert a.shape == b.shape
+            assert np.abs(a - b).max(initial=0.0) <= 1e-9 * most
