@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.contact.convex_edges import OUTSIDE, middles
+from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE, middles
 from dolfinx_nts.contact.edges import LEVEL
 from dolfinx_nts.contact.facing import at_points
 from dolfinx_nts.kernels import compiled, facets
@@ -47,8 +47,10 @@ class NormalCones:
         order, first, count = at_points(ends[:, 0], self._slave.share)
         return _Neighbours(ends[order, 1], first, count)
 
-    def touch(self, node: IntArray, normal: FloatArray, x: FloatArray) -> BoolArray:
-        """Whether planes may touch nodes, shape (n,).
+    def crossing(self, node: IntArray, normal: FloatArray, x: FloatArray) -> FloatArray:
+        """Sine of the angle by which the surface at nodes crosses planes there, shape (n,).
+
+        Zero where it does not: then the plane may touch the node.
 
         Args:
             node: Of this rank's slaves, shape (n,).
@@ -62,8 +64,9 @@ class NormalCones:
         ends = other[first[node][pair] + np.arange(len(pair)) - start[pair]]
         way = x[ends] - x[self._slave.share[node]][pair]
         rise = np.einsum("ni,ni->n", way, normal[pair])
-        found = np.ones(len(node), dtype=bool)
-        found[pair[rise < -LEVEL * np.linalg.norm(way, axis=1)]] = False
+        far, found = np.linalg.norm(way, axis=1), np.zeros(len(node))
+        behind = rise < -LEVEL * far
+        np.maximum.at(found, pair[behind], -rise[behind] / far[behind])
         return found
 
     def across(
@@ -74,7 +77,8 @@ class NormalCones:
 
         Where the surface of the slave crosses the plane of the facet that the node comes to, it
         slides on the edge, and the node goes over the edge with it, also if it comes there a little
-        deeper, by what flat facets let an edge in between nodes.
+        deeper, by what flat facets let an edge in between nodes. Where it crosses the planes of
+        both facets, as flat surfaces do, that which it crosses less holds the node.
 
         Args:
             node: Slaves, shape (n,).
@@ -91,7 +95,8 @@ class NormalCones:
             return now
 
         place, normal = middles(corners(np.arange(len(node)), facet))
-        some = np.flatnonzero(~self.touch(node, normal, slave))
+        crossing = self.crossing(node, normal, slave)
+        some = np.flatnonzero(crossing)
         for edge in range(at.shape[1] if some.size else 0):
             beside = self._edges.beside[facet[some], edge]
             sharp = (beside >= 0) & (self._edges.joined[facet[some], edge] < 0)
@@ -101,8 +106,9 @@ class NormalCones:
             depth, convex = (-_rise(p, over, outward) for p in (x[own], place[own]))
             _, distance = compiled.closest_point(x[own], across)
             size = facets.size(across)
-            near = (convex > 0.0) & (depth > -OUTSIDE * size) & (distance < LETS_IN * size)
-            near[near] = self.touch(node[own[near]], outward[near], slave)
+            near = (convex > 0.0) & (depth > -ASIDE * size) & (distance < LETS_IN * size)
+            less = self.crossing(node[own[near]], outward[near], slave) < crossing[own[near]]
+            near[near] = less
             found[own[near]] = other[near]
         return found
 

@@ -71,9 +71,15 @@ class SlavePaths:
         aimed = motion.aimed
         if self._pair.is_long(motion.reach):
             stops = self._pair.stops(np.arange(len(x)), master)
-            hit, _ = passages.first_hits(
+            hit, part = passages.first_hits(
                 x, slave_path, corners, master_path[self._master.facets], stops
             )
+            over = self._over_edges(hit, part, slave, slave_path, (master, master_path))
+            passed = np.flatnonzero(over >= 0)
+            self._sliding = np.unique(
+                np.concatenate([self._sliding, np.column_stack([passed, hit[passed]])]), axis=0
+            )
+            hit[passed] = -1
             aimed = np.where(hit >= 0, hit, aimed)
         node = np.flatnonzero(aimed >= 0)
         if len(node):
@@ -226,6 +232,25 @@ class SlavePaths:
         )
         return found, slides
 
+    def _over_edges(
+        self, hit: IntArray, part: FloatArray, slave: FloatArray, way: FloatArray,
+        master: tuple[FloatArray, FloatArray],
+    ) -> IntArray:  # fmt: skip
+        """Facets across sharp edges over which slaves go, in place of those hit, or -1, (share,).
+
+        Args:
+            hit: First facets on the ways of this rank's slaves, or -1, shape (share,).
+            part: How much of their ways they have behind them there, shape (share,).
+            slave: Points of the slave at t_n [m].
+            way: Motion of these slaves [m], shape (share, 3).
+            master: Points of the master at t_n, and their motion [m].
+        """
+        over = np.full(len(hit), -1)
+        some = np.flatnonzero((hit >= 0) & self._convex.sharp[hit])
+        at = slave[self._slave.share[some]] + part[some, None] * way[some]
+        over[some] = self._cones.across(some, hit[some], at, slave, master, part[some])
+        return over
+
     def _excess(self, xi: FloatArray) -> FloatArray:
         """How far beyond the nearest edge coordinates (n, 2) lie, as of `edge_excess`, (n,)."""
         excess: FloatArray = facets.edge_excess(xi, self._master.facets.shape[1]).max(axis=1)
@@ -291,7 +316,7 @@ class SlavePaths:
             self._refuse_cut_corners(x, positions[1], *paths, let_go)
         hit = np.full(len(held), -1)
         if self._pair.is_long(reach):
-            hit = self.came_through(x, positions[1], *paths, held)
+            hit = self.came_through(positions, *paths, held)
         if by_edges.size:
             beyond, near = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
             hit[by_edges] = np.where(beyond >= 0, beyond, hit[by_edges])
@@ -381,16 +406,16 @@ class SlavePaths:
 
     def came_through(
         self,
-        x: FloatArray,
-        master: FloatArray,
+        positions: Sequence[FloatArray],
         slave_path: FloatArray,
         master_path: FloatArray,
         held: IntArray,
     ) -> IntArray:
-        """`missed` of nodes that have passed a facet, with arguments as of `_round_edges`."""
-        at = self._master.facets
+        """`missed` of nodes that have passed a facet, with other arguments of `_round_edges`."""
+        at, (slave, master) = self._master.facets, positions[:2]
+        x = slave[self._slave.share]
         stops = self._pair.stops(np.arange(len(x)), master)
-        hit, _ = passages.first_hits(x, slave_path, master[at], master_path[at], stops)
+        hit, part = passages.first_hits(x, slave_path, master[at], master_path[at], stops)
         node = np.flatnonzero((hit >= 0) & (hit != held))
         end, moved = (x + slave_path)[node], master + master_path
         start = np.zeros((len(node), 2))
@@ -400,8 +425,9 @@ class SlavePaths:
         depth = (np.einsum("ni,ni->n", normal, foot - end) + self._pair.offset[node]) / length
         # A node that is held at another facet may end a little behind this one.
         deep = depth > np.where(held[node] >= 0, MARGIN, OUTSIDE)
+        over = self._over_edges(hit, part, slave, slave_path, (master, master_path))
         hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
-        return hit
+        return np.where((hit >= 0) & (over >= 0), over, hit)
 
     def gather(self, paths: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Displacements of this rank's slaves and of all points of the master [m]. Collective."""

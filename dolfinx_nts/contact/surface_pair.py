@@ -289,8 +289,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """
         if not self.is_long(reach):
             return None
-        x, paths = positions[0][self.slave.share], self.slave_paths.gather(motions)
-        through = np.flatnonzero(self.slave_paths.came_through(x, positions[1], *paths, held) >= 0)
+        paths = self.slave_paths.gather(motions)
+        through = np.flatnonzero(self.slave_paths.came_through(positions, *paths, held) >= 0)
         text = None
         if through.size:
             text = (

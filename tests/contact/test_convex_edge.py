@@ -141,3 +141,38 @@ def test_a_sharp_edge_that_slides_up_a_roof_passes_the_nodes_of_its_ridge(raised
     # Where the middle node is raised, the edge starts over the slope and the top is not flat.
     room = metre * stiffness * (1e-9 + 2.0 * raised)
     np.testing.assert_allclose(push[settled], (press * right)[settled], atol=room)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("ahead", [0.01, 0.03, 0.09])
+@pytest.mark.fast("0.03-0.3")
+def test_the_face_above_an_edge_does_not_catch_a_node_of_a_slope(ahead, friction):
+    """Nodes of a hook's slope that the edge of a catch comes to just before they meet the face.
+
+    The slope crosses the planes of both faces at the edge, so that neither touches it: the hook
+    bends as a wedge on a spring, push = force tan(slope + angle of friction).
+    """
+    length, width, slope = 22.0, 3.0, 0.475
+    mesh = box(high=(length, width, 1.0), cells=(22, 2, 1))
+    x = mesh.geometry.x
+    x[:, 2] *= 1.5 + np.interp(x[:, 0], [0.0, 17.0, 18.0, length], [0.0, 0.0, 1.4, -0.5])
+    soft = nts.NeoHookean(young=2000.0, poisson=0.35)
+    held = nts.Dirichlet(lambda x: x[0] < 1e-9)
+    hook = nts.Continuum(mesh, soft, density=1e-9, bcs=[held], name="hook")
+    edge = 1.5 - 0.5 + slope * (1.0 - ahead)
+    catch = nts.RigidBody(
+        box(low=(21.75, -0.5, edge), high=(25.0, width + 0.5, edge + 5.0), cells=(1, 4, 1)),
+        density=1e-9, motion=lambda t: (-t, 0, 0), rotation=(0, 0, 0), name="catch",
+    )  # fmt: skip
+    slopes = hook.surface(lambda x: (x[0] > 16.5) & (x[2] > 0.1))
+    pair = nts.ContactPair(slave=slopes, master=catch.surface(everywhere), friction=friction)
+    system = nts.System([hook, catch], contacts=[pair])
+    run = nts.equilibrium(system, load_steps=np.linspace(0.0, 1.25, 6)[1:])
+    assert run.status == "completed"
+    push, _, force = np.abs(run.contact_forces[-1, 0])
+    # A cantilever's end turns by 3/2 of its deflection over its length.
+    at = 21.75 - 1.25
+    turn = 1.5 * slope * (21.0 + ahead - at) / at
+    right = np.tan(np.arctan(slope) + turn + np.arctan(friction))
+    np.testing.assert_allclose(push, force * right, rtol=5e-3)
