@@ -1,4 +1,4 @@
-"""Vertices, nodes of sharp edges and round places of a master, which facets of its slave keep out.
+"""Vertices and nodes of sharp edges of a master, which facets of its slave keep outside.
 
 Slave nodes say nothing of what enters a facet of the slave between them. That is the contact of
 nodes with facets once more, with the roles exchanged.
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import search
-from dolfinx_nts.contact.convex_edges import OUTSIDE, middles
+from dolfinx_nts.contact.convex_edges import OUTSIDE
 from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.pair import Candidates, Found, Motion
@@ -174,31 +174,12 @@ def corners_of(pair: Any) -> list[Corners]:
     """
     if not (isinstance(pair, FacetPair) and pair.has_edges) or pair.slave.massless.any():
         return []
-    found = len(pair.sharp_edges[1].ends) or _round_places(pair).size
-    return [Corners(pair)] if pair.holds_nodes and found else []
+    return [Corners(pair)] if pair.holds_nodes and len(pair.sharp_edges[1].ends) else []
 
 
 def _with_corners(pair: FacetPair) -> Surface:
     """A pair's master as a slave of its corners."""
     edges, master = pair.sharp_edges[1], pair.master
-    chosen = np.isin(master.points, edges.surface.points[edges.ends])
-    chosen[_round_places(pair)] = True
-    found: Surface = master.part(chosen)
+    ends: IntArray = np.unique(edges.surface.points[edges.ends])
+    found: Surface = master.part(np.isin(master.points, ends))
     return found
-
-
-def _round_places(pair: FacetPair) -> IntArray:
-    """Nodes of a master that is so round there that it may enter the slave's largest facet.
-
-    A facet of size s touches a surface of radius r at its corners, with s^2/(8 r) of it inside.
-    """
-    slave, master, at = pair.slave, pair.master, pair.master.facets
-    largest = float(facets.size(slave.reference[slave.facets]).max(initial=0.0))
-    (place, normal), (one, two, edge) = middles(master.reference[at]), pair.convex.smooth
-    way = place[two] - place[one]
-    turn = np.arccos(np.clip(np.einsum("ni,ni->n", normal[one], normal[two]), -1.0, 1.0))
-    deep = largest * turn > 8.0 * _OUTSIDE * np.linalg.norm(way, axis=1)
-    deep &= np.einsum("ni,ni->n", way, normal[one]) < 0.0
-    one, edge = one[deep], edge[deep]
-    ends: IntArray = np.concatenate([at[one, edge], at[one, (edge + 1) % at.shape[1]]])
-    return ends
