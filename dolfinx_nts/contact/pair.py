@@ -122,8 +122,8 @@ class ContactPair:
             where their meshes are, and may be that deep inside each other without a warning. At
             most half a facet of the master inwards; edges stay as meshed [m].
         edges: Whether sharp edges of solid and rigid bodies are kept out of each other, too, and
-            the master's nodes there and at round places out of the slave's facets; else they may
-            pass between the slave's nodes, mostly without a word.
+            the master's nodes there out of the slave's facets; else they may pass between the
+            slave's nodes, mostly without a word.
         integration: What of the slave is kept out: its "nodes", or the "surface" between them in
             the mean around each node, by points of all facets (theory section 17).
 
