@@ -1,4 +1,4 @@
-"""Linear solves with the bodies' mass, with constraints and without them."""
+"""Linear solves of bodies by themselves: with their mass, or by factors of any matrix."""
 
 from __future__ import annotations
 
