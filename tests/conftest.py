@@ -42,8 +42,8 @@ LONG = {
     "test_stability", "test_docs", "test_demo_output", "test_unwritten", "test_massless",
     "test_demo_blocks", "test_demo_stability", "test_conformance", "test_impacts", "test_tradeoff",
 }  # fmt: skip
-#: On several ranks one fast and one slow case of a test run, others in the next week. In serial all
-#: of them run, and what ranks do seldom depends on the case.
+#: On several ranks, and with --one-case, one fast and one slow case of a test run, others in the
+#: next week. In serial all of them run: ranks and other libraries seldom fail a single case.
 WEEK = datetime.date.today().isocalendar().week
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
@@ -81,10 +81,17 @@ def pytest_addoption(parser):
     group = parser.getgroup("noise", "rounding as on another machine, see tests/noise.py")
     group.addoption("--noise", choices=noise.KINDS, help="what is noisy")
     group.addoption("--noise-seed", type=int, default=0, help="another seed, another machine")
+    parser.addoption(
+        "--one-case", action="store_true", help="of each test the case of this week, as on ranks"
+    )
+
+
+def _one_case(config) -> bool:
+    return COMM.size > 1 or config.option.one_case
 
 
 def pytest_report_header(config):
-    lines = [f"cases on ranks: those of week {WEEK}"] if COMM.size > 1 else []
+    lines = [f"cases: those of week {WEEK}"] if _one_case(config) else []
     if kind := config.option.noise:
         lines.append(f"noise: {kind}, seed {config.option.noise_seed}")
     return lines
@@ -148,7 +155,7 @@ def pytest_collection_modifyitems(config, items):
     if not named and "PYTEST_XDIST_WORKER" not in os.environ and any(unknown.values()):
         missing = [f"{test}: {sorted(ids)}" for test, ids in unknown.items() if ids]
         raise pytest.UsageError("marks name no test: " + "; ".join(missing))
-    if COMM.size > 1 and not named:
+    if _one_case(config) and not named:
         _drop_cases(config, items)
 
 
