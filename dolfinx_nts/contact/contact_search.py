@@ -374,14 +374,15 @@ class ContactSearch:
         """Multipliers of the contact forces of the last step, shape (n, constraints).
 
         In statics nodes that touch at t_n start as active: without inertia a body may have nothing
-        but its contacts to hold it. Where a solution of this step has missed contacts, they are its
-        forces.
+        but its contacts to hold it. Where a solution of this step has missed contacts, and in the
+        relaxations of a load step, they are its forces.
         """
         c, multipliers = self.elements[k], self.carried(k)
         if c.pair.redundant:
             # Else rounding adds up over steps in forces that sticking nodes exert on each other.
             multipliers[:, 1:] = 0.0
-        if not self._step.integrator.inertia and self._carried is self._old:
+        solved = self._carried is not self._old or (self._step.dt == 0.0 and self.carried_any())
+        if not self._step.integrator.inertia and not solved:
             near = _TOUCHING * c.candidates.length
             carries = self._old[self.numbers[k]].force[c.candidates.node] > 0.0
             # Where nothing carries yet, bodies may touch at a point and have all means open.

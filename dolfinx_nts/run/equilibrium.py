@@ -137,8 +137,8 @@ def equilibrium(
         load_steps: Number of equal steps from 0, or the pseudo time of `start`, to 1, or the
             increasing pseudo times where they end.
         stabilization: Stiffness, over that of its own, that holds each node where it was while a
-            load step is solved; the step is then repeated until nothing of it is left in the
-            forces. 0.1 is a good value.
+            load step is solved that is not solved without it; the step is then repeated until
+            nothing of it is left in the forces. 0.1 is a good value.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
         output: Writers, as in `simulate`; all ranks call them after every load step.

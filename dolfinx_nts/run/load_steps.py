@@ -234,16 +234,22 @@ class LoadStepper(Stepper):
         """Solution of a load step, its state, Newton iterations, what the relaxations took.
 
         Each relaxation starts where the last one ended and is held there a little by the
-        stabilization: a proximal-point iteration, whose limit knows nothing of it.
+        stabilization: a proximal-point iteration, whose limit knows nothing of it. Where something
+        else resists all motions as the step begins, it is tried without before.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search, lowest, way, moved = True, 0.0, 0.0, 0.0
+        search, lowest, way, moved, tried = True, 0.0, 0.0, 0.0, False
         size = problem.lengths.radius + problem.lengths.director
         relaxed, strays = _Relaxed(self.system), iter(_STRAYS)
         problem.stabilization.share = self._stabilization
         state = replace(kept, v=self.solution.rates)
         try:
             for _ in range(_RELAXATIONS):
+                share, alone = problem.stabilization.share, False
+                if share and not tried:
+                    tried, problem.stabilization.share = True, 0.0
+                    alone = not self._unheld(state, dt)
+                    problem.stabilization.share = 0.0 if alone else share
                 try:
                     step = self._solve(state, dt, search)
                     reached = state_after(problem, step, time)
@@ -256,9 +262,15 @@ class LoadStepper(Stepper):
                     )
                     reached = replace(reached, contacts=contacts)
                     self._check_missed(reached)
+                    moved = float(problem.lengths.motion_of(step).max()) / size
+                    if alone and moved > _FAR:
+                        raise StepFailedError("without stabilization bodies move far")
                 except UserFunctionError:
                     raise
                 except StepFailedError as failure:
+                    if alone:
+                        problem.stabilization.share = share
+                        continue
                     # Bodies in search of each other move by load over stabilization, whatever dt.
                     if not 0.0 < problem.stabilization.share < _STIFFEST:
                         unheld = self._unheld(state, dt)
@@ -282,7 +294,6 @@ class LoadStepper(Stepper):
                     # On the facets that its nodes have come to, the rest is another one.
                     search, last = True, np.inf
                     continue
-                moved = float(problem.lengths.motion_of(step).max()) / size
                 share = problem.stabilization.share
                 if left < _RELIEVED * last:
                     problem.stabilization.share *= _RELIEF

@@ -56,7 +56,8 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
             images.append(result.array_r.copy())
     a = np.array(images)
     sizes = np.zeros((2, len(modes), len(modes)))
-    sizes[0] = a @ a.T
+    with np.errstate(over="ignore", invalid="ignore"):
+        sizes[0] = a @ a.T
     for i, (k, x) in enumerate(modes):
         for j, (m, y) in enumerate(modes):
             sizes[1, i, j] = x @ y if k == m else 0.0
