@@ -147,10 +147,10 @@ class OfInvariants(Plain):
         polynomials = (i1, i2, i3)
 
         def at(tau: float) -> list[Expr]:
-            return [_polynomial(i, tau) for i in polynomials]
+            return [polynomial(i, tau) for i in polynomials]
 
         def power(tau: float) -> Expr:
-            rates = [_polynomial([k * c for k, c in enumerate(i)][1:], tau) for i in polynomials]
+            rates = [polynomial([k * c for k, c in enumerate(i)][1:], tau) for i in polynomials]
             first, *rest = (
                 s * r for s, r in zip(self._material.slopes(*at(tau)), rates, strict=True)
             )
@@ -166,8 +166,8 @@ class OfInvariants(Plain):
         return 2 * ((first + second * i[0]) * ufl.Identity(3) - second * a + third * cofactor(a))
 
 
-def _polynomial(coefficients: Sequence[Any], x: float) -> Expr:
-    """Sum of c_k x^k."""
+def polynomial(coefficients: Sequence[Any], x: Any) -> Any:
+    """Sum of c_k x^k, k = 0, 1, ..."""
     value = coefficients[-1]
     for c in coefficients[-2::-1]:
         value = c + x * value
