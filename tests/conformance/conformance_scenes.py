@@ -73,7 +73,7 @@ def rigid_on_rubber(frame):
     mesh = frame.grid("tetrahedron", (0, 0, 0), (1, 1, 0.5), (2, 2, 1))
     below = frame.where(lambda x: x[:, 2] < 1e-6)
     shear, bulk = _moduli(frame)
-    law = nts.Ogden(mu=(shear / 4, -shear / 4), alpha=(4.0, -4.0), bulk=bulk)
+    law = nts.Ogden(mu=(shear / 1.5,), alpha=(3.0,), bulk=bulk)
     block = nts.Continuum(mesh, law, density=DENSITY, bcs=[nts.Dirichlet(below)], name="block")
     brick = _rigid(
         frame, (0.31, 0.28, 0.501), (0.68, 0.59, 0.7), "brick", spin=(0, 0, 3),
