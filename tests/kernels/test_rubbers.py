@@ -65,6 +65,12 @@ class Point:
 _POINTS = {}
 
 
+def each(test):
+    """Of each material."""
+    test = pytest.mark.fast("yeoh", "ogden")(test)
+    return pytest.mark.parametrize("name", MATERIALS)(test)
+
+
 def point(name):
     if name not in _POINTS:
         _POINTS[name] = Point(MATERIALS[name])
@@ -122,7 +128,7 @@ TESTS = {
 }
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@each
 def test_stress_over_stretch(name):
     for stretches in TESTS.values():
         for a in (0.6, 0.95, 0.999, 1.001, 1.006, 1.02, 1.3, 2.0, 4.0):
@@ -133,18 +139,19 @@ def test_stress_over_stretch(name):
             assert abs(cauchy[0] - cauchy[2] - expected) < 1e-10 * abs(expected)
 
 
-def test_simple_shear():
+@each
+def test_simple_shear(name):
     """Of F = 1 + g e_1 x e_2, whose stress comes from that of its principal axes."""
-    for name in MATERIALS:
-        for g in (0.01, 0.5, 2.0):
-            f = EYE + g * np.outer(EYE[0], EYE[1])
-            cauchy = f @ point(name)("stress", 0.5 * (f.T @ f - EYE)) @ f.T
-            a = 0.5 * (g + np.sqrt(g**2 + 4))
-            # sigma_12 = (s_1 - s_2)/2 sin 2 phi, tan 2 phi = 2/g.
-            expected = true_stress(name, a, 1 / a) / np.sqrt(4 + g**2)
-            assert abs(cauchy[0, 1] - expected) < 1e-10 * expected
+    for g in (0.01, 0.5, 2.0):
+        f = EYE + g * np.outer(EYE[0], EYE[1])
+        cauchy = f @ point(name)("stress", 0.5 * (f.T @ f - EYE)) @ f.T
+        a = 0.5 * (g + np.sqrt(g**2 + 4))
+        # sigma_12 = (s_1 - s_2)/2 sin 2 phi, tan 2 phi = 2/g.
+        expected = true_stress(name, a, 1 / a) / np.sqrt(4 + g**2)
+        assert abs(cauchy[0, 1] - expected) < 1e-10 * expected
 
 
+@pytest.mark.slow
 def test_ogden_of_exponents_2_and_minus_2_is_mooney_rivlin():
     """Where the volume is kept; then Mooney and Rivlin's terms of the volume push evenly."""
     ogden = Point(nts.Ogden(mu=(240.0, -80.0), alpha=(2.0, -2.0), bulk=BULK))
@@ -172,7 +179,7 @@ def states():
         yield 0.5 * (c - EYE), way + way.T
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@each
 def test_tangent_is_that_of_the_stress_and_the_stress_of_the_energy(name):
     at, size = point(name), 1e-4
     for e, way in states():
@@ -185,7 +192,7 @@ def test_tangent_is_that_of_the_stress_and_the_stress_of_the_energy(name):
         assert abs(found - expected) < 1e-6 * BULK * np.linalg.norm(way)
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@each
 def test_work_of_the_discrete_gradient_is_the_change_of_the_energy(name):
     at, every = point(name), [e for e, _ in states()]
     for e0, e1 in zip(every, every[1:] + every[:1], strict=True):
@@ -194,18 +201,18 @@ def test_work_of_the_discrete_gradient_is_the_change_of_the_energy(name):
         assert abs(work - change) < 1e-12 * max(at("energy", e) for e in (e0, e1))
 
 
-def test_moduli_at_small_strain():
+@each
+def test_moduli_at_small_strain(name):
     series = 1 + 3 / (5 * 9) + 99 / (175 * 81) + 513 / (875 * 729) + 42039 / (67375 * 6561)
-    moduli = {
+    shear = {
         "yeoh": 2 * C10,
         "arruda-boyce": MU * series,
         "ogden": sum(m * a for m, a in zip(MODULI, EXPONENTS, strict=True)) / 2,
-    }
-    for name, shear in moduli.items():
-        bulk, found = MATERIALS[name].small_strain
-        assert bulk == BULK and found == pytest.approx(shear, rel=1e-14)
-        e = 1e-9 * (np.outer(EYE[0], EYE[1]) + np.outer(EYE[1], EYE[0]))
-        assert point(name)("stress", e)[0, 1] == pytest.approx(2e-9 * shear, rel=1e-8)
-        # tr stress = 3 K tr E.
-        stress = point(name)("stress", 1e-9 * EYE)
-        assert np.trace(stress) == pytest.approx(9 * BULK * 1e-9, rel=1e-7)
+    }[name]
+    bulk, found = MATERIALS[name].small_strain
+    assert bulk == BULK and found == pytest.approx(shear, rel=1e-14)
+    e = 1e-9 * (np.outer(EYE[0], EYE[1]) + np.outer(EYE[1], EYE[0]))
+    assert point(name)("stress", e)[0, 1] == pytest.approx(2e-9 * shear, rel=1e-8)
+    # tr stress = 3 K tr E.
+    stress = point(name)("stress", 1e-9 * EYE)
+    assert np.trace(stress) == pytest.approx(9 * BULK * 1e-9, rel=1e-7)

@@ -64,9 +64,6 @@ class Continuum(UflBody):
             What it or a parameter of the material is changed to between steps, e.g. by
             `before_step`, holds in the next one; what that does to the energy is
             `material_change` in the balance.
-        viscosity: eta [Pa s], >= 0, likewise: adds the stress 2 eta dE/dt to that of W, with E of
-            Green (theory section 2). What it takes is `viscous_dissipation` in the balance, which
-            never decreases. In equilibrium it does nothing.
         velocity: Initial velocity [m/s]: a vector, a callable x (3, n) -> (3, n) as in DOLFINx's
             interpolate, or a Function of vectors on the mesh.
         displacement: Displacement [m] from the stress-free mesh in which the body starts, as
@@ -96,6 +93,9 @@ class Continuum(UflBody):
         volume: "projected": W takes the change of volume of each cell in the mean, so that cells do
             not lock where the material hardly changes its volume (nu near 0.5), and bend more
             easily; for hexahedra of degree 1. "full": W at each point, as it is.
+        viscosity: eta [Pa s], >= 0, as `density`: adds the stress 2 eta dE/dt to that of W, with E
+            of Green (theory section 2). What it takes is `viscous_dissipation` in the balance,
+            which never decreases. In equilibrium it does nothing.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -119,7 +119,6 @@ class Continuum(UflBody):
         material: Callable[[Any], Any],
         *,
         density: Parameter,
-        viscosity: Parameter = 0.0,
         velocity: Values = (0.0, 0.0, 0.0),
         displacement: Values = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
@@ -132,6 +131,7 @@ class Continuum(UflBody):
         allow_inversion: bool = False,
         volume: str = "full",
         bending: bool = False,
+        viscosity: Parameter = 0.0,
     ) -> None:
         check_material(material, density, viscosity)
         for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
