@@ -23,6 +23,8 @@ from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.bodies.solid.continuum import Continuum
 from dolfinx_nts.bodies.solid.form_body import FormBody
 from dolfinx_nts.bodies.solid.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
+from dolfinx_nts.bodies.solid.ogden import Ogden
+from dolfinx_nts.bodies.solid.rubber import ArrudaBoyce, Yeoh
 from dolfinx_nts.bodies.solid.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
@@ -81,6 +83,7 @@ __version__ = version("dolfinx_nts")
 __all__ = [
     "AboutAxis",
     "Adapt",
+    "ArrudaBoyce",
     "Beam",
     "BetweenPoints",
     "Body",
@@ -126,6 +129,7 @@ __all__ = [
     "Newton",
     "Obstacle",
     "ObstaclePair",
+    "Ogden",
     "OutputError",
     "Part",
     "Planar",
@@ -170,6 +174,7 @@ __all__ = [
     "Universal",
     "UserFunctionError",
     "Writer",
+    "Yeoh",
     "bodies_from_gmsh",
     "bodies_from_tags",
     "cauchy_stress",

@@ -60,6 +60,7 @@ class Body:
         starts_moved: Whether the user has given it a displacement to start with.
         pieces: Number of parts of its mesh that share no node, of solid bodies. Collective.
         stressed: Stress of the undeformed body over its stiffness, once it is known and too large.
+        losses: Columns of the balance table for energy that leaves through it, see `lost`.
         destroyed: Whether `destroy` was called.
     """
 
@@ -90,6 +91,7 @@ class Body:
     starts_moved: bool = False
     pieces: int = 1
     stressed: float | None = None
+    losses: tuple[str, ...] = ()
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
     _shown: tuple[FloatArray, ...] = ()
@@ -138,6 +140,16 @@ class Body:
         raise self._missing("potential")
 
     # ---- what may be left as it is
+    def lost(self, u1: FloatArray) -> dict[str, float]:
+        """Power that leaves it where the step takes its forces, this rank's part [W], by `losses`.
+
+        Internal forces do its work. Collective.
+
+        Args:
+            u1: Displacement at t_{n+1} [m].
+        """
+        return {}
+
     def inner_at_rest(self, u: FloatArray) -> FloatArray:
         """`inner` in equilibrium with a displacement [m]. Collective."""
         return np.empty(0)

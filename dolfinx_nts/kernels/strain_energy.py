@@ -130,7 +130,8 @@ class OfInvariants(Plain):
 
     def stress(self, e: Expr) -> Expr:
         """dW/dE, symmetric: the second Piola-Kirchhoff stress."""
-        return self._stress(e, invariants(e))
+        i = invariants(e)
+        return self._stress(e, i[0], self._material.slopes(*i))
 
     def along(self, e0: Expr, e1: Expr) -> Path:
         """W between two strains, where the invariants are polynomials of tau."""
@@ -147,27 +148,30 @@ class OfInvariants(Plain):
         polynomials = (i1, i2, i3)
 
         def at(tau: float) -> list[Expr]:
-            return [_polynomial(i, tau) for i in polynomials]
+            return [polynomial(i, tau) for i in polynomials]
+
+        # What UFL is given twice it compares branch by branch.
+        middle = self._material.slopes(*at(0.5))
 
         def power(tau: float) -> Expr:
-            rates = [_polynomial([k * c for k, c in enumerate(i)][1:], tau) for i in polynomials]
-            first, *rest = (
-                s * r for s, r in zip(self._material.slopes(*at(tau)), rates, strict=True)
-            )
+            rates = [polynomial([k * c for k, c in enumerate(i)][1:], tau) for i in polynomials]
+            slopes = middle if tau == 0.5 else self._material.slopes(*at(tau))
+            first, *rest = (s * r for s, r in zip(slopes, rates, strict=True))
             return sum(rest, start=first)
 
         end, start = (self._material.of_invariants(*at(tau)) for tau in (1.0, 0.0))
-        return Path(power, self._stress(0.5 * (e0 + e1), at(0.5)), end - start)
+        mean = 0.5 * (e0 + e1)
+        return Path(power, self._stress(mean, at(0.5)[0], middle), end - start)
 
-    def _stress(self, e: Expr, i: Sequence[Any]) -> Expr:
-        """dW/dE where the invariants are known."""
+    def _stress(self, e: Expr, i1: Expr, slopes: Sequence[Expr]) -> Expr:
+        """dW/dE where the first invariant and the slopes are known."""
         a = 2 * e
-        first, second, third = self._material.slopes(*i)
-        return 2 * ((first + second * i[0]) * ufl.Identity(3) - second * a + third * cofactor(a))
+        first, second, third = slopes
+        return 2 * ((first + second * i1) * ufl.Identity(3) - second * a + third * cofactor(a))
 
 
-def _polynomial(coefficients: Sequence[Any], x: float) -> Expr:
-    """Sum of c_k x^k."""
+def polynomial(coefficients: Sequence[Any], x: Any) -> Any:
+    """Sum of c_k x^k, k = 0, 1, ..."""
     value = coefficients[-1]
     for c in coefficients[-2::-1]:
         value = c + x * value

@@ -49,8 +49,14 @@ COLUMNS = (
 
 
 def columns(system: System) -> tuple[str, ...]:
-    """Columns of a system's balance table: `COLUMNS`, and what its joints add."""
-    return COLUMNS + tuple(dict.fromkeys(name for j in system.joints for name in j.losses))
+    """Columns of a system's balance table: `COLUMNS`, and what its joints and bodies add."""
+    return COLUMNS + _losses(system)
+
+
+def _losses(system: System) -> tuple[str, ...]:
+    """Columns for energy that leaves through joints and bodies."""
+    owners = (*system.joints, *system.bodies)
+    return tuple(dict.fromkeys(name for owner in owners for name in owner.losses))
 
 
 #: Columns that add up over the steps, and those that count in a step.
@@ -190,19 +196,22 @@ def _momenta(body: Body, u: FloatArray, momentum: FloatArray) -> tuple[FloatArra
 def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     """Works and counts of an accepted step, the same on all ranks. Collective.
 
-    Loads and supports do external work; what elements add, they name, see `Elements.ledger`.
+    Loads and supports do external work; what elements and bodies add, they name, see
+    `Elements.ledger` and `Body.lost`.
 
     Returns:
         By columns of the balance table: works [J] and counts of the step, min_gap [m] (infinite
         without candidates), min_det (infinite without flexible bodies; see `Body.smallest_det`).
     """
     scale = 1.0 / problem.factor
-    losses = (name for joint in problem.system.joints for name in joint.losses)
+    losses = _losses(problem.system)
     sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
     sums["external_work"] = scale * problem.loads.work_at_ends(step)
     for (k, *_), terms in zip(problem.batches.numbers, step.terms, strict=True):
         work = scale * float(terms.external @ terms.du)
         sums["external_work"] += work + problem.supports.work(k, terms, problem.factor)
+    for name, lost in _lost_by_bodies(problem, step):
+        sums[name] += lost
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():
             sums[name] += value
@@ -218,6 +227,27 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
         **dict(zip(smallest, least.tolist(), strict=True)),
         "min_det": step.min_det,
     }
+
+
+def _lost_by_bodies(problem: StepProblem, step: Evaluation) -> Iterator[tuple[str, float]]:
+    """Columns and energies [J] of what leaves through bodies in a step, on this rank. Collective.
+
+    As work of loads, it is the mean of both ends in the methods that carry accelerations, see
+    `Loads.work_at_ends`.
+    """
+    rule, state, dt = problem.integrator, problem.state, problem.dt
+    for k, (body, terms) in enumerate(zip(problem.system.bodies, step.bodies, strict=True)):
+        if not body.losses:
+            continue
+        if not rule.accelerations:
+            yield from ((name, dt * power) for name, power in body.lost(terms.u1).items())
+            continue
+        moment, v0 = problem.loads.moments[k], state.v[k]
+        v1, _ = problem.supports.advance(k, terms.du, v0, state.acceleration(k))
+        for u, v in ((moment.u0, v0), (terms.u1, v1)):
+            body.begin_step(rule, moment._replace(u0=u, rate=0.0, drift=v))
+            yield from ((name, 0.5 * dt * power) for name, power in body.lost(u).items())
+        body.begin_step(rule, moment)
 
 
 def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:

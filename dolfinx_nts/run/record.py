@@ -201,7 +201,7 @@ class Record:
             lines.append("no ledger was kept")
         else:
             others = {"massless_defect": -1.0} | dict.fromkeys(CHANGES, 1.0)
-            # What joints add are losses.
+            # What joints and bodies add are losses.
             others |= dict.fromkeys(self.balance.keys() - set(COLUMNS), -1.0)
             more = "".join(
                 f"{' + ' if sign > 0 else ' - '}{name.replace('_', ' ')} {last[name]:.6g}"

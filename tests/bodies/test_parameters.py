@@ -56,6 +56,8 @@ def stretched(mesh, material, density=DENSITY):
         (nts.StVenantKirchhoff, {"young": YOUNG, "poisson": POISSON}),
         (nts.NeoHookean, {"young": YOUNG, "poisson": POISSON}),
         (nts.MooneyRivlin, {"a": 2e4, "b": 1e4, "c": 1e5}),
+        (nts.ArrudaBoyce, {"mu": 2e4, "stretch": 3.0, "bulk": 1e5}),
+        (lambda mu, bulk: nts.Ogden((mu, 1e3), (2.0, -3.3), bulk), {"mu": 2e4, "bulk": 1e5}),
     ],
 )
 def test_they_are_as_numbers(law, values, kind):

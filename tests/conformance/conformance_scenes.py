@@ -62,11 +62,18 @@ def block_on_a_plane(frame):
     return nts.System([block], contacts=[pair], gravity=_gravity(frame))
 
 
+def _moduli(frame):
+    """Shear and bulk modulus of rubber."""
+    young, poisson = frame.size(RUBBER["young"], 2), RUBBER["poisson"]
+    return young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
+
+
 def rigid_on_rubber(frame):
     """A spinning rigid brick falls on a block of tetrahedra that stands on supports."""
     mesh = frame.grid("tetrahedron", (0, 0, 0), (1, 1, 0.5), (2, 2, 1))
     below = frame.where(lambda x: x[:, 2] < 1e-6)
-    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    shear, bulk = _moduli(frame)
+    law = nts.Ogden(mu=(shear / 1.5,), alpha=(3.0,), bulk=bulk)
     block = nts.Continuum(mesh, law, density=DENSITY, bcs=[nts.Dirichlet(below)], name="block")
     brick = _rigid(
         frame, (0.31, 0.28, 0.501), (0.68, 0.59, 0.7), "brick", spin=(0, 0, 3),
@@ -222,13 +229,14 @@ def sewn(frame):
 
 
 def in_a_bore(frame):
-    """A block of Mooney's rubber and one of the user's own energy, each in a bore."""
+    """A viscous block of Mooney's rubber and one of the user's own energy, each in a bore."""
     modulus = frame.size(RUBBER["young"], 2)
     mesh = frame.grid("hexahedron", (0, 0, 0), (0.6, 0.3, 0.3), (2, 2, 2))
     law = nts.MooneyRivlin(a=0.2 * modulus, b=0.05 * modulus, c=modulus)
     block = nts.Continuum(
-        mesh, law, density=DENSITY, velocity=frame.place(0.3, 0, -1.2), name="block"
-    )
+        mesh, law, density=DENSITY, viscosity=frame.size(100.0, 2), name="block",
+        velocity=frame.place(0.3, 0, -1.2),
+    )  # fmt: skip
     mesh = frame.grid("tetrahedron", (2, 0, 0), (2.4, 0.3, 0.3), (1, 1, 1))
     space = compat.vector_space(mesh, 1)
     # A Constant, so that all units share the compiled forms.
@@ -262,7 +270,8 @@ def fold(frame):
         speed = -1.5 * np.sign(y) * np.maximum(x, 0.0)
         return frame.place(np.column_stack([-0.3 * speed, speed, 0.2 * speed])).T
 
-    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    shear, bulk = _moduli(frame)
+    law = nts.Yeoh(c10=shear / 2, c20=-shear / 20, c30=shear / 100, bulk=bulk)
     strip = nts.Continuum(mesh, law, density=DENSITY, velocity=closing, name="strip")
     sides = strip.surface(frame.where(lambda x: np.abs(np.abs(x[:, 1]) - 0.02) < 1e-6))
     return nts.System([strip], contacts=[nts.SelfContact(sides, friction=0.3)])
@@ -334,7 +343,8 @@ def over_waves(frame):
     x, y, z = frame.back(mesh.geometry.x).T
     z = z + 0.03 * np.sin(6 * x) * np.cos(4 * y) * (1 + z / 0.3)
     mesh.geometry.x[:] = frame.place(np.column_stack([x, y, z]))
-    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    shear, bulk = _moduli(frame)
+    law = nts.ArrudaBoyce(mu=shear, stretch=3.0, bulk=bulk)
     plate = nts.Continuum(mesh, law, density=DENSITY, name="plate")
     block = _solid(
         frame, "hexahedron", (0.21, 0.23, 0.025), (0.61, 0.63, 0.3), (2, 2, 1), "block",

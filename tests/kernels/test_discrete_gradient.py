@@ -241,11 +241,24 @@ def test_moduli_at_small_strain(name):
         lambda: nts.StVenantKirchhoff(1.0, -1.0),
         lambda: nts.MooneyRivlin(1.0, -1.0, 1.0),
         lambda: nts.MooneyRivlin(1.0, 1.0, 0.0),
+        lambda: nts.Yeoh(0.0, 1.0, 1.0, 1.0),
+        lambda: nts.Yeoh(1.0, 1.0, float("nan"), 1.0),
+        lambda: nts.ArrudaBoyce(1.0, 1.0, 1.0),
+        lambda: nts.Ogden((1.0,), (-2.0,), 1.0),
     ],
 )
 def test_impossible_materials_are_refused(make):
-    with pytest.raises(ValueError, match="must"):
+    with pytest.raises(ValueError, match="must|pass a finite"):
         make()
+
+
+def test_terms_of_ogden_that_do_not_fit_are_refused():
+    with pytest.raises(TypeError, match="mu=1.0: pass a tuple"):
+        nts.Ogden(1.0, (2.0,), 1.0)
+    with pytest.raises(ValueError, match="pass as many of each"):
+        nts.Ogden((1.0, 2.0), (2.0,), 1.0)
+    with pytest.raises(ValueError, match=r"alpha\[1\]=0: pass a number between"):
+        nts.Ogden((1.0, 2.0), (2.0, 0), 1.0)
 
 
 # ---- discrete gradients

@@ -25,6 +25,7 @@ COMM = MPI.COMM_WORLD
 YOUNG, POISSON, STEEPNESS = 1000.0, 0.3, 50.0
 MU, LAM = YOUNG / 2.6, YOUNG * POISSON / (1.3 * 0.4)
 A, B, C = 120.0, 70.0, 900.0
+C10, C20, C30, STRETCH, BULK = 180.0, -30.0, 8.0, 2.5, 2000.0
 
 
 class Fung(nts.Isotropic):
@@ -42,6 +43,19 @@ MATERIALS = {
     "neo-hooke": nts.NeoHookean(YOUNG, POISSON),
     "mooney-rivlin": nts.MooneyRivlin(A, B, C),
     "fung": Fung(),
+    "yeoh": nts.Yeoh(C10, C20, C30, BULK),
+    "arruda-boyce": nts.ArrudaBoyce(MU, STRETCH, BULK),
+    # Powers 2 and -2 of C, which decimals know without its principal values.
+    "ogden": nts.Ogden(mu=(40.0, -90.0), alpha=(4.0, -4.0), bulk=BULK),
+}
+#: Their part of the first and second invariant of J^(-2/3) C.
+ISOCHORIC = {
+    "yeoh": lambda i, _: sum(Decimal(c) * (i - 3) ** k for k, c in enumerate((C10, C20, C30), 1)),
+    "arruda-boyce": lambda i, _: sum(
+        Decimal(MU) * n / d / Decimal(STRETCH) ** (2 * k - 2) * (i**k - 3**k)
+        for k, (n, d) in enumerate(((1, 2), (1, 20), (11, 1050), (19, 7000), (519, 673750)), 1)
+    ),
+    "ogden": lambda i, j: Decimal(10) * (i**2 - 2 * j - 3) + Decimal(22.5) * (j**2 - 2 * i - 3),
 }
 SIZES = [0.2, 1e-2, 3e-3, 1e-4, 3e-5, 1e-6, 1e-9, 1e-12]
 
@@ -63,6 +77,10 @@ def energy(name, e):
         second = (trace**2 - square) / 2
         volumetric = k / 2 * (det.sqrt() - 1) ** 2 - (a + 2 * b) * det.ln()
         return a * (trace - 3) + b * (second - 3) + volumetric
+    if name in ISOCHORIC:
+        shrunk = det ** (-Decimal(1) / 3)
+        volumetric = Decimal(BULK) / 4 * (det - 1 - det.ln())
+        return ISOCHORIC[name](shrunk * trace, shrunk**2 * (trace**2 - square) / 2) + volumetric
     linear = trace - 3
     if name == "fung":
         linear = ((steepness * linear).exp() - 1) / steepness

@@ -16,12 +16,14 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
+from dolfinx_nts.bodies.solid.arguments import check_cells, check_material
 from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
 from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans, NodesOfCells
 from dolfinx_nts.bodies.solid.materials import bulk_over_shear, misfit, with_constants
-from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
+from dolfinx_nts.bodies.solid.parameters import Parameter
 from dolfinx_nts.bodies.solid.stress_jumps import StressJumps
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
+from dolfinx_nts.bodies.solid.viscosity import check_viscosity, is_viscous, viscous_work
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
@@ -33,9 +35,7 @@ from dolfinx_nts.validation import (
     is_whole,
     items,
     known_options,
-    require_bool,
     require_name,
-    require_one_of,
     vector_in_time,
 )
 
@@ -93,6 +93,9 @@ class Continuum(UflBody):
         volume: "projected": W takes the change of volume of each cell in the mean, so that cells do
             not lock where the material hardly changes its volume (nu near 0.5), and bend more
             easily; for hexahedra of degree 1. "full": W at each point, as it is.
+        viscosity: eta [Pa s], >= 0, as `density`: adds the stress 2 eta dE/dt to that of W, with E
+            of Green (theory section 2). What it takes is `viscous_dissipation` in the balance,
+            which never decreases. In equilibrium it does nothing.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -128,8 +131,9 @@ class Continuum(UflBody):
         allow_inversion: bool = False,
         volume: str = "full",
         bending: bool = False,
+        viscosity: Parameter = 0.0,
     ) -> None:
-        _check_material(material, density)
+        check_material(material, density, viscosity)
         for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
             if value is not None and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
@@ -137,13 +141,15 @@ class Continuum(UflBody):
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         least = check_mesh(mesh, name)
         degree = degree or least
-        _check_cells(mesh, degree, least, name, volume, bending)
+        viscous = is_viscous(viscosity)
+        check_cells(mesh, degree, least, name, volume, bending, viscous)
         quadrature_degree = quadrature_degree or 2 * degree
         super().__init__(
             compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
-            allow_inversion,
+            allow_inversion, self._viscous if viscous else None,
         )  # fmt: skip
-        self.material, self.density = material, density
+        self.material, self.density, self.viscosity = material, density, viscosity
+        self.losses = ("viscous_dissipation",) if viscous else ()
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
         self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
         self.body_force, self._traction = body_force, traction
@@ -154,7 +160,7 @@ class Continuum(UflBody):
         changing = any(callable(value) for value, _ in self._loads_at(0.0))
         self.loads_in_time = changing or extra_form is not None
         self._stand(bcs, velocity, displacement)
-        self._rho = self._density(density)
+        self._rho, self._eta = self._density(density), self._on_mesh("viscosity", viscosity)
         self.law = strain_energy(with_constants(material, self.mesh))
         self._volume = volume
         self._modes = BendingModes(mesh) if bending else None
@@ -164,7 +170,9 @@ class Continuum(UflBody):
         self._check_energy()
         law, means = self.energy()
         energy, load = law(green_strain(self.gradient)), self._load_in_ufl()
-        (self._load_form,) = self._set_forms(energy * self._dx, load, means=means)
+        (self._load_form,) = self._set_forms(
+            energy * self._dx, load, means=means, others=[self._eta]
+        )
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
         self._jumps: tuple[StressJumps, CellMeans | None] | None = None
@@ -242,6 +250,7 @@ class Continuum(UflBody):
     def _check_parameters(self) -> None:
         """Raise ValueError unless density and moduli are in their ranges."""
         super()._check_parameters()
+        check_viscosity(self.viscosity)
         if isinstance(self.material, Isotropic):
             self.material.check()
 
@@ -258,12 +267,21 @@ class Continuum(UflBody):
         work = ufl.inner(rule.piola(law, h0, h1), ufl.grad(w)) * self._dx
         return work, None if means is None else partial(FormWithMeans, means)
 
+    def _viscous(self, u: Any, v: Any, w: Any) -> Any:
+        """Virtual work of the viscosity in UFL."""
+        return viscous_work(self._eta, u, v, w) * self._dx
+
     # ---- as of Body
+    def lost(self, u1: FloatArray) -> dict[str, float]:
+        """As of `Body`."""
+        return {name: self._forms.power(u1) for name in self.losses}
+
     @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
+        own["viscosity"] = self.viscosity
         own |= {"volume": self._volume, "bending": self._modes is not None}
         return own | loads | super().settings
 
@@ -403,42 +421,3 @@ class Continuum(UflBody):
             (value, vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit))
             for name, value, unit in given
         ]
-
-
-def _check_material(material: Any, density: Parameter) -> None:
-    if not callable(material):
-        raise TypeError(
-            f"material={material!r}: pass a callable C -> W(C), "
-            "e.g. NeoHookean(young=1e6, poisson=0.3)"
-        )
-    require_positive_parameter("density", density, "kg/m^3")
-
-
-def _check_cells(
-    mesh: Mesh, degree: int, least: int, name: str, volume: str, bending: bool
-) -> None:
-    """Raise unless cells, of a mesh of degree `least`, can have what they are to have."""
-    if degree < least:
-        raise ValueError(
-            f"degree={degree!r} of {name!r}: its mesh is of degree {least}; leave degree out, "
-            "or pass nts.linear(mesh)"
-        )
-    require_one_of("volume", volume, ("full", "projected"))
-    require_bool("bending", bending)
-    kind = compat.cell_name(mesh)
-    plain = degree == 1 and kind == "hexahedron"
-    if volume == "projected" and not plain:
-        raise ValueError(
-            f"volume={volume!r} of {name!r}: is for hexahedra of degree 1, not for {kind}s of "
-            f"degree {degree}; use volume='full'"
-        )
-    if bending and not plain:
-        raise ValueError(
-            f"bending={bending!r} of {name!r}: is for hexahedra of degree 1, not for {kind}s of "
-            f"degree {degree}; use degree=2, which bends without it"
-        )
-    if bending and volume == "projected":
-        raise ValueError(
-            f"bending={bending!r}, volume={volume!r} of {name!r}: the volume of a cell in the "
-            "mean would undo its bending; pass one of the two"
-        )

@@ -21,7 +21,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -72,9 +72,31 @@ def misfit(expressions: Iterable[Expr], domain: Any) -> str | None:
     return None
 
 
+@dataclass(frozen=True)
+class Elastic(Isotropic):
+    """An isotropic material made of parameters, the fields of a dataclass.
+
+    A field is a `Parameter` or a tuple of them. A subclass has `check`, `moduli`, `small_strain`
+    and `of_invariants`, and `slopes` where they are cheap to write out.
+    """
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    @cached_property
+    def moduli(self) -> tuple[Any, ...]:
+        """What W is made of, the same number of them for all of its kind, made of the fields."""
+        raise NotImplementedError(f"{type(self).__name__} needs moduli")
+
+    @property
+    def small_strain(self) -> tuple[Any, Any]:
+        """Bulk and shear modulus of the undeformed material [Pa]."""
+        raise NotImplementedError(f"{type(self).__name__} needs small_strain")
+
+
 @known_options
 @dataclass(frozen=True)
-class StVenantKirchhoff(Isotropic):
+class StVenantKirchhoff(Elastic):
     """W = lam/2 (tr E)^2 + mu E : E with E = (C - 1)/2; for moderate strains only.
 
     Attributes:
@@ -88,9 +110,6 @@ class StVenantKirchhoff(Isotropic):
     young: Parameter
     poisson: Parameter
 
-    def __post_init__(self) -> None:
-        self.check()
-
     def check(self) -> None:
         """Raise ValueError if a parameter is out of its range."""
         _check_elastic(self.young, self.poisson)
@@ -99,6 +118,12 @@ class StVenantKirchhoff(Isotropic):
     def moduli(self) -> tuple[Expr, ...]:
         """Lame's mu and lambda [Pa]."""
         return _lame(self.young, self.poisson)
+
+    @property
+    def small_strain(self) -> tuple[Any, Any]:
+        """Bulk and shear modulus of the undeformed material [Pa]."""
+        mu, lam = self.moduli
+        return lam + 2 * mu / 3, mu
 
     def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3], with tr E = I_1/2 and E : E = (I_1^2 - 2 I_2)/4."""
@@ -113,7 +138,7 @@ class StVenantKirchhoff(Isotropic):
 
 @known_options
 @dataclass(frozen=True)
-class NeoHookean(Isotropic):
+class NeoHookean(Elastic):
     """W = mu/2 (tr C - 3 - ln det C) + lam/8 (ln det C)^2.
 
     Attributes:
@@ -128,9 +153,6 @@ class NeoHookean(Isotropic):
     young: Parameter
     poisson: Parameter
 
-    def __post_init__(self) -> None:
-        self.check()
-
     def check(self) -> None:
         """Raise ValueError if a parameter is out of its range."""
         _check_elastic(self.young, self.poisson)
@@ -139,6 +161,12 @@ class NeoHookean(Isotropic):
     def moduli(self) -> tuple[Expr, ...]:
         """Lame's mu and lambda [Pa]."""
         return _lame(self.young, self.poisson)
+
+    @property
+    def small_strain(self) -> tuple[Any, Any]:
+        """Bulk and shear modulus of the undeformed material [Pa]."""
+        mu, lam = self.moduli
+        return lam + 2 * mu / 3, mu
 
     def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3]."""
@@ -156,7 +184,7 @@ class NeoHookean(Isotropic):
 
 @known_options
 @dataclass(frozen=True)
-class MooneyRivlin(Isotropic):
+class MooneyRivlin(Elastic):
     """W = a (tr C - 3) + b (tr cof C - 3) + c/2 (J - 1)^2 - d ln J, d = 2 (a + 2 b).
 
     This d makes the undeformed body free of stress.
@@ -177,9 +205,6 @@ class MooneyRivlin(Isotropic):
     b: Parameter
     c: Parameter
 
-    def __post_init__(self) -> None:
-        self.check()
-
     def check(self) -> None:
         """Raise ValueError if a parameter is out of its range."""
         for name, value in (("a", self.a), ("b", self.b)):
@@ -193,6 +218,12 @@ class MooneyRivlin(Isotropic):
     def moduli(self) -> tuple[Expr, ...]:
         """The coefficients a, b and c [Pa]."""
         return self.a, self.b, self.c
+
+    @property
+    def small_strain(self) -> tuple[Any, Any]:
+        """Bulk and shear modulus of the undeformed material [Pa]."""
+        a, b, c = self.moduli
+        return c + 4 * (a + 4 * b) / 3, 2 * (a + b)
 
     def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3]."""
@@ -214,16 +245,10 @@ class MooneyRivlin(Isotropic):
 
 def bulk_over_shear(material: Any) -> float:
     """Bulk over shear modulus of an undeformed material of this package; of any other one 0."""
-    given = [getattr(material, f.name) for f in fields(material)] if is_dataclass(material) else []
-    if not given or not all(map(is_number, given)):
+    if not isinstance(material, Elastic) or not all(map(is_number, _each(material))):
         return 0.0
-    if isinstance(material, MooneyRivlin):
-        mu, lam = 2 * (material.a + material.b), material.c + 4 * material.b
-    elif isinstance(material, NeoHookean | StVenantKirchhoff):
-        mu, lam = _lame(material.young, material.poisson)
-    else:
-        return 0.0
-    return float(lam / mu + 2 / 3)
+    bulk, shear = material.small_strain
+    return float(bulk / shear)
 
 
 def with_constants(material: Any, mesh: Mesh) -> Expr:
@@ -233,18 +258,26 @@ def with_constants(material: Any, mesh: Mesh) -> Expr:
         material: Any; others are returned as they are.
         mesh: DOLFINx mesh of the forms.
     """
-    if type(material) not in (StVenantKirchhoff, NeoHookean, MooneyRivlin):
+    if not isinstance(material, Elastic):
         return material
     shared = copy.copy(material)
-    given = {f.name: getattr(material, f.name) for f in fields(material)}
-    numbers = [name for name, value in given.items() if is_number(value)]
-    if len(numbers) == len(given):
+    if all(map(is_number, _each(material))):
         # Moduli are made of numbers once, and of others wherever a form asks for them.
         moduli = fem.Constant(mesh, np.array(material.moduli, dtype=np.float64))
         vars(shared)["moduli"] = tuple(moduli[k] for k in range(len(material.moduli)))
         return shared
     vars(shared).pop("moduli", None)
+    given = {f.name: getattr(material, f.name) for f in fields(material)}
+    # A tuple keeps its numbers, such as exponents.
+    single = {name: value for name, value in given.items() if not isinstance(value, tuple)}
+    numbers = [name for name, value in single.items() if is_number(value)]
     if numbers:
         constants = fem.Constant(mesh, np.array([given[n] for n in numbers], dtype=np.float64))
         vars(shared).update({name: constants[k] for k, name in enumerate(numbers)})
     return shared
+
+
+def _each(material: Elastic) -> list[Any]:
+    """Parameters of a material one by one."""
+    given = (getattr(material, field.name) for field in fields(material))
+    return [one for value in given for one in (value if isinstance(value, tuple) else (value,))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -76,6 +76,24 @@ VirtualWork = Callable[
 ]
 
 
+class _Compiled(NamedTuple):
+    """Forms by a rule.
+
+    Attributes:
+        work: Internal virtual work, with that of a viscosity.
+        tangent: Mass and stiffness.
+        extra: Extra virtual work, if there is any.
+        power: What a viscosity takes [W], if there is any.
+        cells: What is within cells, if there is anything.
+    """
+
+    work: Any
+    tangent: Any
+    extra: Any
+    power: Any
+    cells: WithinCells | None
+
+
 class StepForms:
     """What a body's energy does in a step, compiled once for each integrator.
 
@@ -88,6 +106,8 @@ class StepForms:
             that it holds within cells.
         mass: Kinetic energy's second derivative in UFL, (v, w) -> form.
         extra: As `extra_form` of `Continuum`.
+        viscous: Virtual work of a viscosity in UFL, linear in v and w: (u, v, w) -> form of the
+            place and the velocity where forces are taken; None: there is none.
         check_alive: Raises an error once the body was destroyed.
     """
 
@@ -97,11 +117,13 @@ class StepForms:
         virtual_work: VirtualWork,
         mass: MassForm,
         extra: ExtraForm | None,
+        viscous: Callable[[Any, Any, Any], Any] | None,
         check_alive: Callable[[], None],
     ) -> None:
         self._check_alive = check_alive
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
-        self._forms: dict[Integrator, tuple[Any, Any, Any, WithinCells | None]] = {}
+        self._viscous = viscous
+        self._forms: dict[Integrator, _Compiled] = {}
         self._u0, self._u1, self._drift = (fem.Function(space) for _ in range(3))
         # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their counts
         # as text, and a form would be compiled again where 9 and 10 meet.
@@ -119,16 +141,17 @@ class StepForms:
 
     def begin(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
-        self._work, self._tangent, self._extra_work, self._cells = self._compiled(rule)
+        forms = self._compiled(rule)
+        self._work, self._tangent, self._extra_work, self._power, self._cells = forms
         if self._matrix is None:
             self._matrix = petsc_compat.create_matrix(self._tangent)
         fill(self._u0, moment.u0)
         if self._cells is not None:
             self._cells.begin(moment.inner)
-        if self._extra is not None:
-            self._rate.value, self._time.value = moment.rate, moment.time
-            if moment.drift is not None:
-                fill(self._drift, moment.drift)
+        self._rate.value, self._time.value = moment.rate, moment.time
+        rates = self._extra is not None or self._viscous is not None
+        if rates and moment.drift is not None:
+            fill(self._drift, moment.drift)
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces of the step [N]."""
@@ -141,6 +164,13 @@ class StepForms:
             return 0.0
         fill(self._u1, u1)
         return self.assemble(self._extra_work)
+
+    def power(self, u1: FloatArray) -> float:
+        """What a viscosity takes where the step takes its forces, this rank's part [W]."""
+        if self._power is None:
+            return 0.0
+        fill(self._u1, u1)
+        return float(self._power.value())
 
     def tangent(
         self, u1: FloatArray, mass: float, stiffness: float, masks: Any, diagonal: float
@@ -176,7 +206,7 @@ class StepForms:
 
     def inner_at_rest(self, u: FloatArray) -> FloatArray:
         """What is within cells in equilibrium at a displacement, as of `inner`."""
-        *_, cells = self._compiled(EQUILIBRIUM)
+        cells = self._compiled(EQUILIBRIUM).cells
         if cells is None:
             return np.empty(0)
         for function in (self._u0, self._u1):
@@ -186,8 +216,9 @@ class StepForms:
         return cells.inner
 
     def forces(self, rule: Integrator, u0: FloatArray, u1: FloatArray) -> FloatArray:
-        """Internal forces by a rule between two displacements [N]; set the state anew after it."""
+        """Internal forces by a rule between two places of rest [N]; set the state anew after it."""
         work, *_, cells = self._compiled(rule)
+        self._rate.value = 0.0
         fill(self._u0, u0)
         fill(self._u1, u1)
         if cells is not None:
@@ -197,7 +228,7 @@ class StepForms:
 
     def stiffness_at_rest(self) -> FloatArray:
         """Diagonal of the tangent in equilibrium, without deformation [N/m]."""
-        _, tangent, _, cells = self._compiled(EQUILIBRIUM)
+        _, tangent, *_, cells = self._compiled(EQUILIBRIUM)
         kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
         for u in (self._u0, self._u1):
             u.x.array[:] = 0.0
@@ -245,17 +276,20 @@ class StepForms:
             if a is not None:
                 a.destroy()
 
-    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any, WithinCells | None]:
-        """Internal virtual work, tangent, extra virtual work and what is in cells by a rule."""
+    def _compiled(self, rule: Integrator) -> _Compiled:
+        """Forms by a rule, compiled when they are asked for first."""
         if rule not in self._forms:
             du, w = ufl.TrialFunction(self._space), ufl.TestFunction(self._space)
             work, with_cells = self._virtual_work(rule, self._u0, self._u1, w)
-            virtual, extra = work, None
+            extra, power, moved = None, None, self._u1 - self._u0
+            place, velocity = self._u0 + rule.theta * moved, self._rate * moved
+            if rule.accelerations:
+                velocity += self._drift
+            if self._viscous is not None and rule.inertia:
+                work += self._viscous(place, velocity, w)
+                power = self._viscous(place, velocity, velocity)
+            virtual = work
             if self._extra is not None:
-                moved = self._u1 - self._u0
-                place, velocity = self._u0 + rule.theta * moved, self._rate * moved
-                if rule.accelerations:
-                    velocity += self._drift
                 extra = self._extra(place, velocity, w, self._time)
                 if self._u1 in extra.coefficients():  # else the tangent is that without it
                     virtual = work + extra
@@ -265,8 +299,10 @@ class StepForms:
             cells = None if with_cells is None else with_cells(work, w, self._u1)
             own = [work] if cells is None else []
             *own, made = compile_forms([*own, tangent])
-            of_extra = None if extra is None else compile_forms([extra])[0]
-            self._forms[rule] = (own or [cells])[0], made, of_extra, cells
+            of_extra, of_power = (
+                None if form is None else compile_forms([form])[0] for form in (extra, power)
+            )
+            self._forms[rule] = _Compiled((own or [cells])[0], made, of_extra, of_power, cells)
         return self._forms[rule]
 
 

@@ -55,6 +55,7 @@ class UflBody(MeshBody):
         extra_form: As of `Continuum`.
         quadrature_degree: That of the energy; cells of 3D meshes are watched at its points.
         allow_inversion: As of `Continuum`.
+        viscous: Virtual work of a viscosity, as of `StepForms`.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -67,7 +68,7 @@ class UflBody(MeshBody):
 
     def __init__(
         self, space: fem.FunctionSpace, degree: int, name: str, extra_form: ExtraForm | None,
-        quadrature_degree: int, allow_inversion: bool,
+        quadrature_degree: int, allow_inversion: bool, viscous: Any = None,
     ) -> None:  # fmt: skip
         require_name("name", name)
         require_bool("allow_inversion", allow_inversion)
@@ -88,7 +89,7 @@ class UflBody(MeshBody):
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
         self._forms = StepForms(
-            space, self._virtual_work, self._mass_form, extra_form, self.check_alive
+            space, self._virtual_work, self._mass_form, extra_form, viscous, self.check_alive
         )
 
     # ---- what a kind of body has of its own
@@ -199,7 +200,7 @@ class UflBody(MeshBody):
         return nodal_values(self.space, name, self.name, given, unit).ravel()
 
     def _set_forms(
-        self, energy: Any, *loads: Any, means: CellMeans | None = None
+        self, energy: Any, *loads: Any, means: CellMeans | None = None, others: Sequence[Any] = ()
     ) -> list[Any]:
         """Compile mass and energy in UFL and any loads, which are returned.
 
@@ -207,6 +208,7 @@ class UflBody(MeshBody):
             energy: Of `self.u`.
             loads: Linear forms.
             means: Means in cells that the energy holds.
+            others: Expressions whose parameters may change, too.
         """
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         mass, own = self._mass_form(v, w), [self.u]
@@ -218,7 +220,7 @@ class UflBody(MeshBody):
             in_expressions((part.integrand() for part in form.integrals()), own)
             for form in (energy, mass)
         )
-        self._parameters = [*of_energy, *of_mass]
+        self._parameters = [*of_energy, *of_mass, *in_expressions(others)]
         self._taken = Taken(self._parameters), Taken(of_mass)
         if self._extra_form is not None:
             check_extra_form(self, self._extra_form, w)
@@ -237,12 +239,20 @@ class UflBody(MeshBody):
             ValueError: It is on another mesh.
         """
         self._given_density = density
-        if is_number(density):
-            return fem.Constant(self.mesh, float(density))
-        problem = misfit([density], self.mesh.ufl_domain())
+        return self._on_mesh("density", density)
+
+    def _on_mesh(self, name: str, value: Any) -> Any:
+        """A parameter as the forms take it.
+
+        Raises:
+            ValueError: It is on another mesh.
+        """
+        if is_number(value):
+            return fem.Constant(self.mesh, float(value))
+        problem = misfit([value], self.mesh.ufl_domain())
         if problem:
-            raise ValueError(f"density={density!s} of {self.name!r}: {problem}")
-        return density
+            raise ValueError(f"{name}={value!s} of {self.name!r}: {problem}")
+        return value
 
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
