@@ -38,6 +38,7 @@ LEVELS = [
     {"run"},
     {"study"},
     {"__init__"},
+    {"__main__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}
 #: What the kernels do without.
