@@ -122,7 +122,7 @@ def rubbing_blocks(
         return metre * turn @ v
 
     left, right = (
-        nts.Continuum(mesh, rubber, density=1e3 / metre**3, name=name, velocity=v)
+        nts.Continuum(mesh, rubber, density=1e3 / metre**3, degree=1, name=name, velocity=v)
         for (mesh, name), v in zip(bodies, (throw, (0, 0, 0)), strict=True)
     )
     pair = nts.ContactPair(

@@ -358,7 +358,7 @@ def flexible_or_rigid(k, scene, solid, beside, spoilt, comm):
         return linear[:, None] + np.cross(turning, x.T - middle).T
 
     return nts.Continuum(
-        mesh, LAWS[body.law](young, poisson), density=density, bcs=bcs, name=name,
+        mesh, LAWS[body.law](young, poisson), density=density, degree=1, bcs=bcs, name=name,
         velocity=spoilt.get("velocity", velocity),
     )  # fmt: skip
 

@@ -82,7 +82,7 @@ def check_two_blocks(parts, left, right, cells, facets):
         nodes = identities(part)
         assert sorted(nodes) == list(range(27))
         assert {p[0] for p in nodes.values()} == {ends[0], sum(ends) / 2, ends[1]}
-        body = nts.Continuum(part.mesh, RUBBER, density=1.0, name=name)
+        body = nts.Continuum(part.mesh, RUBBER, density=1.0, degree=1, name=name)
         assert COMM.allreduce(body.nodal_mass.sum()) == pytest.approx(3.0, rel=1e-14)
         for x, tag in ((0, 4), (1, 3), (2, 5)):
             if x in ends:
@@ -339,7 +339,7 @@ def check_bar(part, soft, hard):
     young = part.by_region({soft: SOFT, hard: HARD})
     density = part.by_region({soft: 1e3, hard: 3e3})
     body = part.continuum(
-        nts.StVenantKirchhoff(young, 0.0), density=density,
+        nts.StVenantKirchhoff(young, 0.0), density=density, degree=1,
         bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
         traction=[nts.Traction(lambda x: x[0] > 2 - 1e-9, (PULL, 0, 0))],
     )  # fmt: skip
@@ -363,7 +363,7 @@ def test_tags_in_one_body(kind):
     (part,) = parts.values()
     assert part.name == "bar" and not part.regions
     check_bar(part, 7, 9)
-    surface = nts.Continuum(part.mesh, nts.NeoHookean(SOFT, 0.3), density=1.0).surface(
+    surface = nts.Continuum(part.mesh, nts.NeoHookean(SOFT, 0.3), density=1.0, degree=1).surface(
         *part.where("end")
     )
     assert surface.area.sum() == pytest.approx(1.0, rel=1e-14)

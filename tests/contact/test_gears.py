@@ -70,7 +70,7 @@ def gear(teeth, x0, turn, spin, torque, name, soft=False):
     joints = []
     if soft:
         body = part.continuum(
-            nts.NeoHookean(young=2e9, poisson=0.3), density=7800, name=name,
+            nts.NeoHookean(young=2e9, poisson=0.3), density=7800, degree=1, name=name,
             velocity=lambda x: np.array([-spin * x[1], spin * (x[0] - x0), 0.0 * x[0]]),
         )  # fmt: skip
         hub = nts.RigidBody.from_inertia(

@@ -43,7 +43,7 @@ def finger(side):
         value=lambda t: (-side * SQUEEZE * min(t / PRESSED, 1.0), 0, 0),
     )
     rubber = nts.NeoHookean(young=2e5, poisson=0.3)
-    body = nts.Continuum(mesh, rubber, density=1e3, bcs=[held], name=f"finger {side}")
+    body = nts.Continuum(mesh, rubber, density=1e3, degree=1, bcs=[held], name=f"finger {side}")
     return body, body.surface(lambda x: np.abs(x[0] - near) < 1e-9)
 
 

@@ -52,7 +52,7 @@ def plate(facets="squares", low=(-1.0, -1.0), high=(1.0, 1.0), top=0.0, n=(8, 8)
     mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = shape(x, y)
     everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
     body = nts.Continuum(
-        mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1.0, bcs=[everywhere], name=name
+        mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1.0, degree=1, bcs=[everywhere], name=name
     )
     return body, body.surface(lambda x: x[2] > top - 1e-9)
 

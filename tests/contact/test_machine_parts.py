@@ -82,11 +82,12 @@ def test_a_soft_wedge_under_a_held_block(friction, exchanged):
     """Friction acts on both of its faces: push = load (tan(slope + angle) + tan(angle))."""
     rubber, top = nts.NeoHookean(young=1e7, poisson=0.3), height(1.5) + 1.0
     wedge = of_gmsh(prism(WEDGE, -0.5, 0.5), 0.8).continuum(
-        rubber, density=1.0, name="wedge",
+        rubber, density=1.0, degree=1, name="wedge",
         bcs=[nts.Dirichlet(lambda x: x[0] < 1e-6, lambda t: (0.2 * t, 0, 0), components=(0, 1))],
     )  # fmt: skip
     block = of_gmsh(prism(BLOCK, -0.3, 0.3), 0.8).continuum(
-        rubber, density=1.0, name="block", bcs=[nts.Dirichlet(lambda x: x[2] > top - 1e-6)]
+        rubber, density=1.0, degree=1, name="block",
+        bcs=[nts.Dirichlet(lambda x: x[2] > top - 1e-6)],
     )
     floor = of_gmsh(lambda occ: [(3, occ.addBox(-3, -1, -1, 9, 2, 1))], 1.0).rigid(
         density=1.0, name="floor", **STILL
@@ -132,7 +133,7 @@ def seal(walls, friction, rolls=False):
     )
     middle = nts.Dirichlet(lambda x: np.abs(x[0]) < 1e-6, components=(0,))
     cord = of_gmsh(drawn, 0.5).continuum(
-        nts.NeoHookean(young=5.0, poisson=0.3), density=1.0, name="cord",
+        nts.NeoHookean(young=5.0, poisson=0.3), density=1.0, degree=1, name="cord",
         bcs=[ends] if rolls else [ends, middle],
     )  # fmt: skip
     down = {"motion": lambda t: (0, 0, -0.7 * t)}
@@ -236,7 +237,7 @@ def chain(links, interference="refuse"):
             lambda x, k=k: (1 if k else -1) * (x[0] - k * pitch) > ring - 0.5,
             value=lambda t, far=far: (far * t, 0, 0),
         )
-        bodies.append(part.continuum(steel, density=7.8e-9, bcs=[held], name=name))
+        bodies.append(part.continuum(steel, density=7.8e-9, degree=1, bcs=[held], name=name))
     faces = [body.surface(everywhere) for body in bodies[::-1]]
     pairs = [
         nts.ContactPair(*both, interference=interference)

@@ -34,7 +34,8 @@ def slab(kind, cell=CellType.hexahedron, metre=1.0, **options):
         body = nts.RigidBody(mesh, density=1e3 / metre**3, name="slab", **options)
     else:
         material = nts.NeoHookean(1e6 / metre, 0.3)
-        body = nts.Continuum(mesh, material, density=1e3 / metre**3, name="slab", **options)
+        given = {"density": 1e3 / metre**3, "degree": 1, "name": "slab"}
+        body = nts.Continuum(mesh, material, **given, **options)
     return body, body.surface(lambda x: x[2] > -1e-9 * metre)
 
 

@@ -43,7 +43,7 @@ def test_hooks_hold_each_other(size, friction):
             value=lambda t, turned=turned: (0, 0, t if turned else 0.0),
         )
         part = of_gmsh(hook(turned), size)
-        bodies.append(part.continuum(steel, density=7.8e-9, bcs=[held], name=name))
+        bodies.append(part.continuum(steel, density=7.8e-9, degree=1, bcs=[held], name=name))
     low, up = bodies
     pair = nts.ContactPair(up.surface(everywhere), low.surface(everywhere), friction=friction)
     run = nts.equilibrium(nts.System(bodies, contacts=[pair]), load_steps=8)

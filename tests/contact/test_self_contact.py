@@ -296,7 +296,7 @@ def test_the_ends_of_a_clip_of_tetrahedra_do_not_enter_each_other():
         return np.array([1.0 + 0.0 * speed, -4.0 * speed * np.abs(x[0]), 0.5 * speed])
 
     clip = nts.Continuum(
-        part.mesh, nts.NeoHookean(**RUBBER), density=1e3, velocity=velocity, name="clip"
+        part.mesh, nts.NeoHookean(**RUBBER), density=1e3, degree=1, velocity=velocity, name="clip"
     )
     contact = nts.SelfContact(clip.surface(everywhere), friction=0.3)
     depths, cells = [], compat.geometry_dofmap(clip.mesh)
@@ -328,7 +328,7 @@ def test_the_ends_of_a_clip_of_tetrahedra_do_not_enter_each_other():
 # ---- what may touch
 def candidates(mesh):
     """Slave nodes that may touch at rest."""
-    body = nts.Continuum(mesh, nts.NeoHookean(**RUBBER), density=1.0)
+    body = nts.Continuum(mesh, nts.NeoHookean(**RUBBER), density=1.0, degree=1)
     contact = nts.SelfContact(body.surface(everywhere))
     system = nts.System([body], contacts=[contact])
     (depth,) = system.penetration(system.initial_state())

@@ -49,6 +49,7 @@ def plate(shape, facets, uneven, triangles=False):
         mesh,
         nts.StVenantKirchhoff(1.0, 0.3),
         density=1.0,
+        degree=1,
         name="plate",
         bcs=[nts.Dirichlet(lambda x: np.full(x.shape[1], True))],
     )
@@ -191,13 +192,13 @@ def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0, arch=False):
     mesh.geometry.x[:] *= metre
     # Of a scene in mm and tonnes, say: mass and time keep their units.
     rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
-    plate = nts.Continuum(mesh, rubber, density=1e4 / metre**3, name="plate")
+    plate = nts.Continuum(mesh, rubber, density=1e4 / metre**3, degree=1, name="plate")
     low = 0.41 if arch else 0.335
     mesh = create_box(comm, [[0.21, 0.23, low], [0.61, 0.63, low + 0.3]], [2, 2, 1], **cells)
     mesh.geometry.x[:] *= metre
     velocity = metre * np.array([2.0, 0.7, -1.0])
     block = nts.Continuum(
-        mesh, rubber, density=1e4 / metre**3, velocity=tuple(velocity), name="block"
+        mesh, rubber, density=1e4 / metre**3, degree=1, velocity=tuple(velocity), name="block"
     )
     slave = block.surface(lambda x: x[2] < (low + 1e-9) * metre)
     pair = nts.ContactPair(slave, plate.surface(tags, 1, smoothing=smoothing))

@@ -41,11 +41,17 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0, integration="node
         box([0.07, 0.12, 1 + gap], [0.87, 0.92, 1.8 + gap], 2, CELLS[cell]),
         rubber,
         density=1.0,
+        degree=1,
         velocity=(0, 0, -speed),
         name="upper",
     )
     lower = nts.Continuum(
-        box([0, 0, 0], [1, 1, 1], 2, CELLS[cell]), rubber, density=1.5, name="lower", bcs=bcs
+        box([0, 0, 0], [1, 1, 1], 2, CELLS[cell]),
+        rubber,
+        density=1.5,
+        degree=1,
+        name="lower",
+        bcs=bcs,
     )
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),

@@ -43,12 +43,12 @@ RUBBER = nts.NeoHookean(1e6, 0.3)
 def blocks(comm, cell=HEX, friction=0.3, cells=(2, 3), name="right"):
     """A spinning block thrown at a larger one, with friction."""
     left = nts.Continuum(
-        box((0, 0, 0), (1, 1, 1), cells[0], cell, comm), RUBBER, density=1e3, name="left",
+        box((0, 0, 0), (1, 1, 1), cells[0], cell, comm), RUBBER, density=1e3, degree=1, name="left",
         velocity=lambda x: np.array([3 + x[2], 1 + 0 * x[0], -x[0]]),
     )  # fmt: skip
     right = nts.Continuum(
         box((1.04, -0.1, -0.1), (2.05, 1.1, 1.1), cells[1], cell, comm), RUBBER, density=1e3,
-        name=name,
+        degree=1, name=name,
     )  # fmt: skip
     pair = nts.ContactPair(
         slave=left.surface(lambda x: x[0] > 1 - 1e-9),

@@ -242,6 +242,7 @@ def thrown(spin):
         mesh,
         nts.NeoHookean(1e6, 0.3),
         density=1e3,
+        degree=1,
         velocity=lambda x: np.stack([3 - spin * (x[1] - 0.5), spin * (x[0] - 0.5), 0 * x[0]]),
     )
     ground = nts.Plane(point=(0, 0, -10), normal=(0, 0, 1))

@@ -127,7 +127,7 @@ class UflBody(MeshBody):
         if mass == "redistributed" and degree > 1:
             raise ValueError(
                 f"mass={mass!r} of a surface of {self.name!r}: needs degree 1, as at nodes of "
-                f"degree {degree} the mass of some is negative; use mass='consistent'"
+                f"degree {degree} the mass of some is negative; use mass='consistent', or degree=1"
             )
 
     def _make_massless(self, surface: Surface) -> None:
