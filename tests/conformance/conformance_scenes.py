@@ -322,6 +322,19 @@ def of_degree_two(frame):
     return nts.System([below, middle, above], contacts=[surfaces, nodes])
 
 
+def leaf_on_a_pad(frame):
+    """Cells that bend, one over the thickness, on some whose volume is projected; in flight."""
+    pad = _solid(
+        frame, "hexahedron", (0, 0, 0), (1, 1, 0.6), (2, 2, 2), "pad", volume="projected",
+    )  # fmt: skip
+    leaf = _solid(
+        frame, "hexahedron", (-0.4, 0.23, 0.602), (1.4, 0.81, 0.702), (6, 2, 1), "leaf",
+        velocity=frame.place(0.3, 0.1, -0.6), bending=True,
+    )  # fmt: skip
+    pair = nts.ContactPair(_face(frame, leaf, 2, 0.602), _face(frame, pad, 2, 0.6), friction=0.2)
+    return nts.System([leaf, pad], contacts=[pair])
+
+
 def beam_on_a_plate(frame):
     """A beam of degree 2 that slides on a shell."""
     bar = _beam(
@@ -392,5 +405,5 @@ SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
     beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
     fold: 2e-3, hoist: 5e-3, of_degree_two: 2e-3, beam_on_a_plate: 1e-3, over_waves: 2e-3,
-    laws_in_joints: 1e-2,
+    laws_in_joints: 1e-2, leaf_on_a_pad: 2e-3,
 }  # fmt: skip

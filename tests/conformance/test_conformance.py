@@ -12,6 +12,7 @@ from conformance_scenes import (
     beam_on_a_plate,
     fold,
     laws_in_joints,
+    leaf_on_a_pad,
     mechanism,
     of_degree_two,
     over_waves,
@@ -47,7 +48,7 @@ OTHERS = [
     if name != "energy-momentum" and not (scene is laws_in_joints and rule.accelerations)
 ]  # fmt: skip
 #: Scenes of bodies that nothing holds or drives.
-FREE = (two_blocks, tied, fold, of_degree_two, beam_on_a_plate, over_waves)
+FREE = (two_blocks, tied, fold, of_degree_two, beam_on_a_plate, over_waves, leaf_on_a_pad)
 scenes = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
 
 
