@@ -24,7 +24,8 @@ def turned(
     if kind is nts.RigidBody:
         return nts.RigidBody(mesh, density=1e3, name=name, **options)
     material = nts.NeoHookean(young / metre, 0.3)
-    return nts.Continuum(mesh, material, density=1e3 / metre**3, degree=1, name=name, **options)
+    options = {"degree": 1} | options
+    return nts.Continuum(mesh, material, density=1e3 / metre**3, name=name, **options)
 
 
 #: By 45 degrees about x: an edge along x is on top, and one below.

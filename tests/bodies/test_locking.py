@@ -50,8 +50,10 @@ def test_one_layer_of_cells_is_told():
 
 
 def test_tetrahedra_are_told_of():
-    body, run = bar((20, 2, 2), 0.3, kind=CellType.tetrahedron)
+    body, run = bar((20, 2, 2), 0.3, kind=CellType.tetrahedron, degree=1)
     assert "degree=2" in run.warnings["locking"].text and body.name in run.warnings["locking"].about
+    _, by_default = bar((20, 2, 2), 0.3, kind=CellType.tetrahedron)
+    assert "locking" not in by_default.warnings
 
 
 @pytest.mark.slow

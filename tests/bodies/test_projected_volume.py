@@ -233,7 +233,7 @@ def test_parameters_may_change_between_steps():
 @pytest.mark.parametrize(
     ("kind", "options", "told"),
     [
-        (CellType.tetrahedron, {}, "tetrahedrons of degree 1"),
+        (CellType.tetrahedron, {}, "tetrahedrons of degree 2"),
         (CellType.hexahedron, {"degree": 2}, "hexahedrons of degree 2"),
         (CellType.hexahedron, {"volume": "mean"}, "volume='mean'"),
     ],
