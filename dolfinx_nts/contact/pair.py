@@ -132,6 +132,7 @@ class ContactPair:
         extent: Largest of the reference positions' components, relative to it [m].
         given: Largest of the slave's as they were given, whose rounding they have [m].
         offset: Gap at the start that counts as none, of each slave node of `Surface.share` [m].
+        lift: The largest of them, or 0 [m]; alike on all ranks.
 
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
@@ -189,7 +190,7 @@ class ContactPair:
         self.master: Any = master
         self.edges, self.adjust, self.integration = edges, float(adjust), integration
         # Searches reach farther by the largest gap that counts as none.
-        self.offset, self._lift = np.zeros(len(slave.share)), 0.0
+        self.offset, self.lift = np.zeros(len(slave.share)), 0.0
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
@@ -303,7 +304,7 @@ class ContactPair:
 
     def settle(self, u: Sequence[FloatArray]) -> None:
         """Take the gaps at the start that count as none, see `offset`. Collective."""
-        self.offset, self._lift = np.zeros(len(self.slave.share)), 0.0
+        self.offset, self.lift = np.zeros(len(self.slave.share)), 0.0
         if not self.adjust:
             return
         found = self._at_start(self.positions(u), self.path(0.0, 0.0))
@@ -311,7 +312,7 @@ class ContactPair:
         near = np.abs(found.gap) <= self.adjust + rounding
         self.offset[found.node[near]] = found.gap[near]
         largest = np.array([self.offset.max(initial=0.0)])
-        self._lift = float(global_max(self.slave.body.comm, largest)[0])
+        self.lift = float(global_max(self.slave.body.comm, largest)[0])
 
     @property
     def settled(self) -> BoolArray:

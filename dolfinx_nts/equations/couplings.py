@@ -38,16 +38,13 @@ class Couplings:
     Attributes:
         contacts: What makes the elements of contacts. Used directly only for what contacts alone
             have: closing gaps, checkpoints.
-        edges: What makes those of edges, by the number of the contact.
         joints: What makes those of `System.joints`.
         mechanisms: How many groups of bodies joints link.
     """
 
     def __init__(self, system: System) -> None:
-        self.edges = {k: EdgeCoupling(edges) for k, edges in system.edges.items()}
-        self.contacts = ContactSearch(
-            system.pairs, system.pair_bodies, system.comm, self.edges
-        )
+        edges = {k: EdgeCoupling(own) for k, own in system.edges.items()}
+        self.contacts = ContactSearch(system.pairs, system.pair_bodies, system.comm, edges)
         self._contacts = len(system.contacts)
         both = zip(system.joints, system.joint_bodies, strict=True)
         each: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
@@ -66,19 +63,20 @@ class Couplings:
 
     @property
     def _all(self) -> list[Coupling]:
-        return [self.contacts, *self.edges.values(), *(coupling for coupling, _ in self.joints)]
+        return [*self._of_contacts, *(coupling for coupling, _ in self.joints)]
+
+    @property
+    def _of_contacts(self) -> list[Coupling]:
+        return [self.contacts, *self.contacts.edges.values()]
 
     def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step; arguments as of `Coupling.begin`. Collective."""
         state = step.state
         self._remembered = state.contacts
-        for k, edges in self.edges.items():
-            edges.begin(step, state.edges[k], again, search)
         self.contacts.begin(step, state.contacts, again, search)
-        for edges in self.edges.values():
+        for edges in self.contacts.edges.values():
             edges.make()
-        own: list[Coupling] = [self.contacts, *self.edges.values()]
-        self._touching = sum(len(coupling.elements) for coupling in own)
+        self._touching = sum(len(coupling.elements) for coupling in self._of_contacts)
         for coupling, of in self.joints:
             coupling.begin(step, itemgetter(*of)(state.joints), again, search)
 
@@ -86,7 +84,7 @@ class Couplings:
     def elements(self) -> list[Any]:
         """Batches of elements in the step."""
         found: list[Any] = list(self.contacts.elements)
-        for edges in self.edges.values():
+        for edges in self.contacts.edges.values():
             found += edges.elements
         for coupling, _ in self.joints:
             found += coupling.elements
@@ -128,7 +126,7 @@ class Couplings:
     def of_edges(self, e: Evaluation) -> Iterator[tuple[int, EdgeElements, Contribution]]:
         """Numbers of contacts whose edges are near each other, their elements and parts."""
         start = len(self.contacts.elements)
-        for k, coupling in self.edges.items():
+        for k, coupling in self.contacts.edges.items():
             for batch in coupling.elements:
                 part: Any = e.parts[start]
                 yield k, batch, part
@@ -146,7 +144,7 @@ class Couplings:
     def forget_solution(self) -> None:
         """Guess contact forces of t_n again, where those of a solution of the step led nowhere."""
         self.contacts.forget_solution()
-        for edges in self.edges.values():
+        for edges in self.contacts.edges.values():
             edges.forget_solution()
 
     def history(
@@ -159,9 +157,9 @@ class Couplings:
             for k, own in zip(of, found if len(of) > 1 else [found], strict=True):
                 out[k] = own
         contacts = self.contacts.history(e.parts[: len(self.contacts.elements)])
-        edges = [EdgeHistory.of_start() for _ in range(self._contacts)]
+        edges = [EdgeHistory.of_start()] * self._contacts
         for k, _, part in self.of_edges(e):
-            edges[k] = self.edges[k].history([part])
+            edges[k] = self.contacts.edges[k].history([part])
         return contacts, tuple(out), tuple(edges)
 
     def touching(
