@@ -19,7 +19,7 @@ from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Coupling, JointCoupling
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.interaction.measured import Measured, MeasuredPart, rubs
+from dolfinx_nts.interaction.measured import Measured, MeasuredPart, leans, rubs
 from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
@@ -58,8 +58,25 @@ class Couplings:
         linked = _linked(system.joint_bodies[:declared])
         self.mechanisms = max(linked, default=-1) + 1
         self._linked = [np.array([linked[k] for k in of if k < declared]) for _, of in self.joints]
+        self._loads = self._bearings(system)
         # Batches of elements of contacts and of edges in the step, which come first.
         self._touching = 0
+
+    def _bearings(self, system: System) -> dict[int, tuple[int, int, int]]:
+        """Number among `joints` of each law that depends on what its joint carries.
+
+        With the number of that joint, its place among those that are evaluated with it, and in how
+        many constraints it carries.
+        """
+        places = {
+            id(system.joints[n]): (k, row)
+            for k, (_, of) in enumerate(self.joints) for row, n in enumerate(of)
+        }  # fmt: skip
+        return {
+            k: (*places[id(law.of)], law.of.bearing)
+            for k, (_, (n, *_)) in enumerate(self.joints)
+            if leans(getattr(law := system.joints[n], "law", None))
+        }
 
     @property
     def _all(self) -> list[Coupling]:
@@ -104,6 +121,22 @@ class Couplings:
                 several = len(linked) > 1
                 found.append(linked[batch.joint] if several else linked[0] if len(linked) else None)
         return found
+
+    def tell_loads(self, own: Sequence[dict[str, FloatArray]]) -> None:
+        """Add to the unknowns of laws that depend on it what their joints carry, as "load".
+
+        That is the size of the force of a joint's bearing times the factor of the step, (1,).
+
+        Args:
+            own: Of each of `elements` its own unknowns, see `Unknowns.own_values`.
+        """
+        if not self._loads:
+            return
+        starts = np.cumsum([self._touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
+        for i, (k, row, bearing) in self._loads.items():
+            (batch,), unknowns = self.joints[k].coupling.elements, own[starts[k]]["constraints"]
+            force = (batch.scale[:, None] * unknowns)[batch.joint == row, :bearing]
+            own[starts[i]]["load"] = np.linalg.norm(force, axis=1)
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""

@@ -323,6 +323,7 @@ class StepProblem:
         laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
+        self.couplings.tell_loads(own)
         parts = evaluate_together(self.system.comm, elements, positions, own)
         contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)
         self._shared.divide(

@@ -37,6 +37,7 @@ class MeasuredPart(NamedTuple):
         memory: The measure at t_{n+1}, and with a multiplier D and where the measure began, shape
             (n, 1) or (n, 3).
         work: Of the force against the motion of the step [J], shape (n,).
+        law: As it was obeyed.
     """
 
     residual: FloatArray
@@ -44,6 +45,7 @@ class MeasuredPart(NamedTuple):
     status: BoolArray
     memory: FloatArray
     work: FloatArray
+    law: Any
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,7 +109,9 @@ class MeasuredElements(PointElements):
         """Residual and tangent."""
         measure, theta, n = self.measure, self.step.integrator.taken_at, len(x)
         rate, factor = self.step.moments[0].rate, self.step.factor
-        du, held = x - self.y0, holds(self.law)
+        du, held, law = x - self.y0, holds(self.law), self.law
+        if leans(law):
+            law = law.under(own["load"] / factor)
         end = measure.vectors(x)
         if theta is None:
             (a, b), at_a = (self._start, end), self.near
@@ -133,7 +137,7 @@ class MeasuredElements(PointElements):
                 time=self.step.dt if theta is None else None,
                 when=start + (0.5 if theta is None else theta) * self.step.dt,
             )
-            both = zip(self.law.pull(move), (n, gradient.mean.shape), strict=True)
+            both = zip(law.pull(move), (n, gradient.mean.shape), strict=True)
             pull, slope = (np.broadcast_to(np.asarray(f, dtype=float), form) for f, form in both)
             status, memory = np.empty((0, n), dtype=bool), at_end[:, None]
             ends, of_row = none, (none,) * 4
@@ -141,7 +145,7 @@ class MeasuredElements(PointElements):
             length, unit = measure.length, self.force_scale
             force = own["constraints"][:, 0]
             pull, slope = unit / factor * force, np.zeros_like(gradient.mean)
-            row = self.law.row(length * self.since, length * at_end, force, unit / factor)
+            row = law.row(length * self.since, length * at_end, force, unit / factor)
             ends = gradient.end
             if theta is not None:
                 ends = measure.kind.gradient(end, end, at_end, at_end).end
@@ -153,7 +157,7 @@ class MeasuredElements(PointElements):
         )  # fmt: skip
         if held and not self.step.integrator.inertia:
             work = pull * (at_end - self.since)
-        return MeasuredPart(residual, tangent, status, memory, work)
+        return MeasuredPart(residual, tangent, status, memory, work, law)
 
     @cached_property
     def _start(self) -> FloatArray:
@@ -193,6 +197,11 @@ class MeasuredElements(PointElements):
         k = int(size.argmax())
         text, times = f"{self.names[self.joint[k]]!r}", int(flips[:, k].sum())
         return float(size[k]), f"{text}, flips {times} times" if times else text
+
+
+def leans(law: Any) -> bool:
+    """Whether a law depends on what its joint carries."""
+    return bool(getattr(law, "by_load", 0.0))
 
 
 def rubs(coupling: Any) -> TypeGuard[Measured]:
