@@ -22,7 +22,21 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.measured import Measured, MeasuredPart, leans, rubs
 from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import FloatArray, IntArray
+
+
+class Load(NamedTuple):
+    """Whose multipliers a law depends on.
+
+    Attributes:
+        batch: Number of the batch that has them.
+        rows: Its elements on this rank, one of each element of the law's.
+        bearing: How many multipliers of each, the first ones.
+    """
+
+    batch: int
+    rows: IntArray
+    bearing: int
 
 
 class OfJoints(NamedTuple):
@@ -122,21 +136,33 @@ class Couplings:
                 found.append(linked[batch.joint] if several else linked[0] if len(linked) else None)
         return found
 
-    def tell_loads(self, own: Sequence[dict[str, FloatArray]]) -> None:
-        """Add to the unknowns of laws that depend on it what their joints carry, as "load".
+    @property
+    def loads(self) -> dict[int, Load]:
+        """Of the batches among `elements` whose laws depend on what their joints carry."""
+        if not self._loads:
+            return {}
+        starts = np.cumsum([self._touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
+        found = {}
+        for i, (k, row, bearing) in self._loads.items():
+            (batch,) = self.joints[k].coupling.elements
+            found[starts[i]] = Load(starts[k], np.flatnonzero(batch.joint == row), bearing)
+        return found
 
-        That is the size of the force of a joint's bearing times the factor of the step, (1,).
+    def tell_loads(self, own: Sequence[dict[str, FloatArray]]) -> None:
+        """Add to the unknowns of laws that depend on it what their joints carry.
+
+        That is "load", the force of a joint's bearing times the factor of the step, (n, bearing),
+        and "by_unknowns", its derivative by each of these unknowns, (n, 1).
 
         Args:
             own: Of each of `elements` its own unknowns, see `Unknowns.own_values`.
         """
-        if not self._loads:
-            return
-        starts = np.cumsum([self._touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
-        for i, (k, row, bearing) in self._loads.items():
-            (batch,), unknowns = self.joints[k].coupling.elements, own[starts[k]]["constraints"]
-            force = (batch.scale[:, None] * unknowns)[batch.joint == row, :bearing]
-            own[starts[i]]["load"] = np.linalg.norm(force, axis=1)
+        loads = self.loads
+        elements = self.elements if loads else []
+        for i, (k, rows, bearing) in loads.items():
+            scale = elements[k].scale[rows, None]
+            own[i]["load"] = scale * own[k]["constraints"][rows, :bearing]
+            own[i]["by_unknowns"] = scale
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""

@@ -232,7 +232,8 @@ class StepProblem:
         if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
             of = self.couplings.bodies
-            self.unknowns = Unknowns(self.batches, self.awake, elements, of)
+            loads = self.couplings.loads
+            self.unknowns = Unknowns(self.batches, self.awake, elements, of, loads)
             self.version += 1
             self._numbers = numbers
         self._of_none = None

@@ -110,8 +110,10 @@ class MeasuredElements(PointElements):
         measure, theta, n = self.measure, self.step.integrator.taken_at, len(x)
         rate, factor = self.step.moments[0].rate, self.step.factor
         du, held, law = x - self.y0, holds(self.law), self.law
-        if leans(law):
-            law = law.under(own["load"] / factor)
+        leaning = leans(law)
+        if leaning:
+            load = np.linalg.norm(own["load"], axis=1)
+            law = law.under(load / factor)
         end = measure.vectors(x)
         if theta is None:
             (a, b), at_a = (self._start, end), self.near
@@ -155,6 +157,10 @@ class MeasuredElements(PointElements):
             library.load().forces_along, size // 3, a.shape[1], held, share, factor, n,
             measure.weights, *gradient[:2], ends, pull, slope, *of_row, du, residual, tangent, work,
         )  # fmt: skip
+        if leaning:
+            across = own["load"] / np.maximum(load, TINY)[:, None] * own["by_unknowns"]
+            slope = self.scale * row.by_bound * law.by_load / self.force_scale
+            tangent = _widened(tangent, slope[:, None] * across)
         if held and not self.step.integrator.inertia:
             work = pull * (at_end - self.since)
         return MeasuredPart(residual, tangent, status, memory, work, law)
@@ -207,6 +213,14 @@ def leans(law: Any) -> bool:
 def rubs(coupling: Any) -> TypeGuard[Measured]:
     """Whether a coupling is of a law that sticks and slips, see `Rubs`."""
     return isinstance(coupling, Measured) and hasattr(coupling.law, "blurred")
+
+
+def _widened(tangent: FloatArray, across: FloatArray) -> FloatArray:
+    """A tangent (n, r, r) with more columns, (n, c) of which are those of its last row."""
+    (n, size, _), more = tangent.shape, across.shape[1]
+    wide = np.zeros((n, size + more, size + more))
+    wide[:, :size, :size], wide[:, size - 1, size:] = tangent, across
+    return wide
 
 
 class Measured(EveryStep):

@@ -126,10 +126,12 @@ class Bound(NamedTuple):
             # bound in the slope.
             size = np.hypot(slip, self.width)
             slope = (np.clip(force, -most, most) * slip / size - most) / size
-            return Row(force - most * slip / size, slope, np.ones_like(slip), stick)
+            return Row(
+                force - most * slip / size, slope, np.ones_like(slip), stick, -slip / size
+            )
         slides = force - most * np.sign(trial)
         on, off = stick.astype(float), (~stick).astype(float)
-        return Row(np.where(stick, slip, slides), on, off, stick)
+        return Row(np.where(stick, slip, slides), on, off, stick, -off * np.sign(trial))
 
     def blurred(self, width: float) -> Bound:
         """D = bound s/sqrt(s^2 + width^2) of the slip s."""

@@ -5,6 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from integrators import ACCELERATED, MID_STEP
+from measures import dense, differences, relative
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, lsq_linear
 
@@ -519,3 +520,31 @@ def test_each_pin_takes_the_load_of_its_own_joint():
     alone = run({1: 0.4}) | run({2: 0.8})
     assert both == pytest.approx(alone, abs=1e-12)
     assert abs(both[1] - both[2]) > 1e-3
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+def test_the_tangent_knows_the_load_of_a_pin():
+    """The whole Jacobian of a pin that slips, against differences of the residual."""
+    _, system = pendulum(friction=nts.JointFriction(coefficient=0.4, radius=0.05))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    for _ in range(3):
+        stepper.advance(0.02)
+    problem, x = stepper.problem, stepper.problem.x.array_r.copy()
+    x += 1e-4 * np.random.default_rng(1).uniform(-1, 1, len(x))
+
+    def residual(values):
+        other = problem.x.duplicate()
+        other.array_w[:] = values
+        found = problem.residual(problem.evaluate(other))
+        other.destroy()
+        return found
+
+    with problem.x as at:
+        at[:] = x
+    stepper.solver.assemble(problem.evaluate(problem.x))
+    # Joints' rows are lent a compliance, which is in the matrix alone.
+    found = dense(stepper.solver.matrix.operator)[-1]
+    expected = differences(lambda y: np.array([residual(z)[-1] for z in y]), x[None], 1e-6)[0]
+    assert np.count_nonzero(np.abs(found) > 1e-9 * np.abs(found).max()) > 1
+    assert relative(found, expected) < 1e-8
+    stepper.close()
