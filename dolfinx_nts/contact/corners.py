@@ -41,8 +41,8 @@ class Corners(FacetPair):
     def __init__(self, of: FacetPair) -> None:
         self.of = of
         super().__init__(
-            _with_corners(of), of.slave, friction=of.friction, interference=of.interference,
-            adjust=of.adjust,
+            _with_corners(of), of.slave, friction=of.friction_function or of.friction,
+            interference=of.interference, adjust=of.adjust,
         )  # fmt: skip
         # Points are where they are for the pair.
         self.origin, self.extent = of.origin, of.extent
