@@ -381,6 +381,17 @@ class ContactElements(Batch):
         """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""
         return part.multiplier[:, 0] * self.candidates.gap / factor
 
+    def carried(self, old: ContactHistory) -> FloatArray:
+        """Normal and tangential multipliers of the forces of the last step [N], shape (n, 3)."""
+        node = self.candidates.node
+        found, both = np.zeros((len(node), 3)), self.multipliers(
+            old.force[node], old.tangential[node]
+        )
+        found[:, 0] = both[:, 0]
+        if self.pair.friction:
+            found[:, 1:] = both[:, -2:]
+        return found
+
     def history(self, part: Contribution, factor: float, old: ContactHistory) -> ContactHistory:
         """Return what the contact remembers of an accepted step."""
         new = ContactHistory.of_start(len(old.force))

@@ -15,6 +15,7 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
+from dolfinx_nts.contact.slip_friction import SlipFriction
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.types import BoolArray, FloatArray
 
@@ -148,6 +149,7 @@ class ContactLaw(Batch):
         rubs: What pairs with friction that touch obey instead of Coulomb's law.
         before: h^2/2 lambda_N and lambda_T at t_n of massless nodes [kg m], NaN of the others,
             shape (n, 3); None: there are none.
+        varies: What the coefficient depends on; `friction` is that at rest then.
     """
 
     friction: float
@@ -166,6 +168,7 @@ class ContactLaw(Batch):
     overlap: FloatArray | float = 0.0
     rubs: Rub = Rub.LAW
     before: FloatArray | None = None
+    varies: SlipFriction | None = None
 
     # ---- multipliers
     @property
@@ -273,7 +276,7 @@ class ContactLaw(Batch):
         return slides
 
     @cached_property
-    def _kernel(self) -> tuple[Any, list[Any]]:
+    def _law(self) -> compiled_law.Law:
         """What the compiled kernel is to know of the pairs in this step."""
         law = compiled_law.Law(
             self.scale, self.yielding, self.no_force, self.before,
@@ -293,6 +296,21 @@ class ContactLaw(Batch):
                 tangential_scale=self.tangential_scale,
                 unmoved=prescribed.unmoved if prescribed and prescribed.any else None,
             )
+        return law
+
+    @cached_property
+    def _kernel(self) -> tuple[Any, list[Any]]:
+        """The same as the kernel takes it."""
+        return self._law.structure()
+
+    def _at(self, slip: Slip | None, multiplier: FloatArray) -> tuple[Any, list[Any]]:
+        """`_kernel` with coefficients at an iterate, where these depend on it."""
+        if self.varies is None or slip is None:
+            return self._kernel
+        square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
+        found = self.varies.of(np.sqrt(square.clip(min=0.0)), -multiplier[:, 0])
+        mu, by_slip, by_force = found
+        law = self._law._replace(coefficients=mu, by_slip=by_slip, by_force=by_force)
         return law.structure()
 
     def obey(
@@ -314,8 +332,8 @@ class ContactLaw(Batch):
         if prescribed and prescribed.any:
             held = prescribed.held(x, self.still, self.slid)
         return compiled_law.laws(
-            self._kernel, together, found.residual, found.tangent, found.gap, found.slip,
-            multiplier, held, found.normal, found.let_go,
+            self._at(found.slip, multiplier), together, found.residual, found.tangent, found.gap,
+            found.slip, multiplier, held, found.normal, found.let_go,
         )  # fmt: skip
 
     # ---- a solution

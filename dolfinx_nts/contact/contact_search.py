@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from dolfinx_nts.contact.apart import Apart
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
 from dolfinx_nts.contact.corners import Corners
@@ -44,10 +45,11 @@ class ContactSearch:
     """Makes the elements of all contacts of a system, step after step; see `Coupling`.
 
     Attributes:
-        numbers: Of the contacts that may act in this step: all but corners that are near nothing.
+        numbers: Of the contacts, and of corners, that have candidates in this step.
         elements: Candidates of each of these that have unknowns in this step.
         idle: The others, which the step's motion does not bring to their masters.
         idle_gaps: Gaps [m] of the idle candidates of each in the last solution.
+        edges: Those of contacts whose surfaces are near each other in this step, by their number.
     """
 
     def __init__(
@@ -64,11 +66,14 @@ class ContactSearch:
         number = {id(pair): k for k, pair in enumerate(contacts)}
         self._corners = [(c, number[id(c.of)]) for c in contacts if isinstance(c, Corners)]
         self._edges = edges
+        self.edges: dict[int, EdgeCoupling] = {}
+        self._apart = Apart(contacts, bodies)
+        self._sought: list[int] = []
         self._cover, self._repeats = [0.0] * len(contacts), 0
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._begun: State | None = None
-        self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
+        self._had: Sequence[BoolArray] | None = None
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
         before = zip(contacts, held_before(contacts), strict=True)
         self._foreign = [held[pair.slave.share] for pair, held in before]
@@ -76,9 +81,9 @@ class ContactSearch:
     @property
     def had_unknowns(self) -> list[BoolArray]:
         """Which of this rank's slave nodes had unknowns in the last step, of each contact."""
-        if not self.elements:
-            return self._had
-        found = [np.zeros_like(had) for had in self._had]
+        if self._had is not None:
+            return list(self._had)
+        found = [np.zeros(len(pair.slave.share), dtype=bool) for pair in self._pairs]
         for k, c in zip(self.numbers, self.elements, strict=True):
             found[k][c.candidates.node] = True
         return found
@@ -92,7 +97,7 @@ class ContactSearch:
         self, step: Step, history: tuple[ContactHistory, ...], again: Evaluation | None,
         search: bool,
     ) -> None:  # fmt: skip
-        """Make the elements of a step, as of `Coupling`. Collective."""
+        """Make the elements of a step, and begin it for edges, as of `Coupling`. Collective."""
         # Their forces are the first guess: of t_n, or of the solution that is gone on from.
         touching = slice(len(self.elements))
         self._carried = history if again is None else self.history(again.parts[touching])
@@ -101,35 +106,47 @@ class ContactSearch:
             self._begun = step.state
         self._repeats = 0 if again is None else self._repeats
         time = step.state.time
-        self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
-        if again is None:
-            self._aimed = [np.full(len(pair.slave.share), -1) for pair in self._pairs]
         if search:
-            self._followed = [old.followed for old in self._old]
+            self._apart.look(step.state.u, step.motion)
+            of = [*range(self._declared), *(of for _, of in self._corners)]
+            self._sought = [k for k, pair in enumerate(of) if pair not in self._apart.far]
+        self._paths = {k: self._pairs[k].path(time, time + step.dt) for k in self._sought}
+        if again is None:
+            self._aimed: dict[int, IntArray] = {}
+        for k in self._sought:
+            self._aimed.setdefault(k, np.full(len(self._pairs[k].slave.share), -1))
+        near = {k: self._edges[k] for k in self._sought if k in self._edges}
+        for k in self.edges.keys() - near.keys():
+            self._edges[k].leave()
+        self.edges = near
+        for k, edges in near.items():
+            edges.begin(step, step.state.edges[k], again, search)
+        if search:
+            self._followed = {k: self._old[k].followed for k in self._sought}
             self._seek()
         self._choose()
 
     def _seek(self) -> None:
         """Find candidates, and which of them need unknowns. Collective."""
-        numbers, had = list(range(self._declared)), self.had_unknowns
-        found: list[Any] = [self._search(k) for k in numbers]
-        drop_doubles(found, [old.force for old in self._old])
-        for k, (corners, of) in enumerate(self._corners, self._declared):
+        had, declared = self.had_unknowns, [k for k in self._sought if k < self._declared]
+        found: dict[int, Any] = {k: self._search(k) for k in declared}
+        found = {k: c for k, c in found.items() if c is not None}
+        drop_doubles(found, self._old)
+        slaves: dict[int, list[Any]] = {}
+        for c in found.values():
+            slaves.setdefault(id(c.pair.slave.body), []).append((c.pair.slave, c.candidates))
+        for k in self._sought[len(declared) :]:
+            corners, of = self._corners[k - self._declared]
             meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=np.int64)
-            slaves = [
-                (pair.slave, c.candidates)
-                for pair, c in zip(self._pairs, found[: self._declared], strict=False)
-                if pair.slave.body is corners.master.body
-            ]
-            corners.leave_to(slaves, meet)
+            corners.leave_to(slaves.get(id(corners.master.body), []), meet)
             near = self._search(k)
             if near is not None:
-                numbers.append(k)
-                found.append(near)
-        self.numbers, self._found = numbers, found
-        self.bodies = [self._of[k] for k in numbers]
-        both = zip(numbers, found, strict=True)
-        self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in both]
+                found[k] = near
+        self.numbers, self._found = list(found), list(found.values())
+        self._apart.found(self.numbers)
+        self.bodies = [self._of[k] for k in found]
+        self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in found.items()]
+        self._had = None
 
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""
@@ -181,7 +198,7 @@ class ContactSearch:
     def _search(self, k: int) -> ContactElements | None:
         """Candidates of a contact, found anew unless all its bodies slept and nothing moves.
 
-        None: it is one of corners, and has none.
+        None: it has none.
         """
         u = [self._step.state.u[b] for b in self._of[k]]
         known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
@@ -206,12 +223,12 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia or k >= self._declared else None,
         )
-        if k >= self._declared and not anywhere(self._comm, len(found.node) > 0):
-            return None
         beyond = self._edges[k].find(positions, found) if k in self._edges else ()
         found = found.select(~self._foreign[k][found.node])
         if len(beyond):
             found = found.select(~np.isin(pair.slave.share[found.node], beyond))
+        if not anywhere(self._comm, len(found.node) > 0):
+            return None
         overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
         start, end = step.state.time, step.state.time + step.dt
         found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
@@ -234,11 +251,7 @@ class ContactSearch:
             law = replace(law, slid=slid)
         massless = self._massless[k][found.node]
         if step.integrator.inertia and massless.any():
-            old, before = self._old[k], np.zeros((len(massless), 3))
-            carried = elements.multipliers(old.force[found.node], old.tangential[found.node])
-            before[:, 0] = step.factor * carried[:, 0]
-            if pair.friction:
-                before[:, 1:] = step.factor * carried[:, -2:]
+            before = step.factor * elements.carried(self._old[k])
             before[~massless] = np.nan
             law = replace(law, before=before)
         offset = pair.offset[found.node] if pair.adjust else 0.0
@@ -287,8 +300,9 @@ class ContactSearch:
         Raises:
             StepFailedError: A node went through an obstacle and out of it again.
         """
-        missed, batches = False, dict(zip(self.numbers, range(len(parts)), strict=True))
-        for k in range(len(self._pairs)):
+        batches = dict(zip(self.numbers, range(len(parts)), strict=True))
+        missed = self._apart.misses(motion)
+        for k in self._sought:
             reach = self._reach(k, motion)
             missed |= reach > self._cover[k]
             held = np.full(len(self._pairs[k].slave.share), -1)
@@ -346,18 +360,14 @@ class ContactSearch:
 
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""
-        histories = [
-            pair.history_at_start()._replace(slip=old.slip, overlap=old.overlap)
-            for pair, old in zip(self._pairs, self._old, strict=True)
-        ]
+        histories = self._apart.histories(self._old, self._followed)
         for k, c, part, idle, gaps in zip(
             self.numbers, self.elements, parts, self.idle, self.idle_gaps, strict=True
         ):
             new, others = c.history(part, self._step.factor, self._old[k]), idle.candidates
             new.facet[others.node], new.gap[others.node] = others.facet, gaps
-            histories[k] = new
-        both = zip(histories, self._followed, strict=True)
-        return tuple(new._replace(followed=followed) for new, followed in both)
+            histories[k] = new._replace(followed=self._followed[k])
+        return tuple(histories)
 
     def smallest(self, parts: Sequence[Contribution]) -> dict[str, float]:
         """The smallest gap of an accepted step on this rank, infinite without candidates."""

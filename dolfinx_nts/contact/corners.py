@@ -22,8 +22,10 @@ from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-#: What cannot enter a facet by this part of its size is outside.
+#: What cannot enter a facet by this part of its size is outside, as facets that bend sag by it; ...
 _OUTSIDE = 0.05
+#: ... between rigid bodies by this one.
+_FLUSH = 1e-6
 
 
 class Corners(FacetPair):
@@ -39,8 +41,8 @@ class Corners(FacetPair):
     def __init__(self, of: FacetPair) -> None:
         self.of = of
         super().__init__(
-            _with_corners(of), of.slave, friction=of.friction, interference=of.interference,
-            adjust=of.adjust,
+            _with_corners(of), of.slave, friction=of.friction_function or of.friction,
+            interference=of.interference, adjust=of.adjust,
         )  # fmt: skip
         # Points are where they are for the pair.
         self.origin, self.extent = of.origin, of.extent
@@ -163,7 +165,8 @@ class Corners(FacetPair):
             own, k = np.nonzero((point[:, None, None] == self._meet[None, :, :2]).any(axis=2))
             meets = (at[own][:, :, None] == self._meet[k, None, 2:]).any(axis=2)
             np.minimum.at(depth, own, np.where(meets, 0.0, 1.0))
-        held: BoolArray = np.einsum("nk,nk->n", weights, depth) < _OUTSIDE
+        outside = _OUTSIDE if self.yields else _FLUSH
+        held: BoolArray = np.einsum("nk,nk->n", weights, depth) < outside
         return held
 
 

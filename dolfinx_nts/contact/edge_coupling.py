@@ -115,6 +115,12 @@ class EdgeCoupling:
             found = self.contact.within(self.contact.positions(u), self._clear)
             self._pairs = Pairs(self.contact.edges, found) if len(found) else None
 
+    def leave(self) -> None:
+        """Forget where edges are as the surfaces are far from each other."""
+        self._looked, self._last, self._followed, self._pairs = (), (), False, None
+        self._chosen, self._tried, self._end = _NONE, _NONE[:, 0], None
+        self.make()
+
     # ---- which of these may meet in a step
     def begin(
         self, step: Step, history: EdgeHistory, again: Evaluation | None, search: bool

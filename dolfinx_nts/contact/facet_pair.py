@@ -168,17 +168,17 @@ class FacetPair(ContactPair, master=Surface):
     ) -> Found:
         """Search for this rank's candidates, as of `ContactPair`. Collective."""
         self.slave_paths.forget()
-        reach = self._lift + (0.0 if motion is None else motion.reach)
+        reach = self.lift + (0.0 if motion is None else motion.reach)
         every = np.ones(len(self.slave.share), dtype=bool)
         known = every if followed is None else followed
         slaves, master = positions
         corners = master[self.master.facets]
         sizes = facets.size(corners)
         radius, cover = (reach + MARGIN * float(s) for s in (sizes.max(), sizes.min()))
-        cover -= self._lift
+        cover -= self.lift
         # Positions of all points are known everywhere, so all ranks leave here or none.
         if search.apart(slaves, corners, radius):
-            return Found(NO_CANDIDATES, ~every, radius - self._lift)
+            return Found(NO_CANDIDATES, ~every, radius - self.lift)
         x = slaves[self.slave.share]
         self.facing.look(slaves, corners)
         closest = self._closest(slaves, corners, radius, current)

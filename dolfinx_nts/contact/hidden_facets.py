@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import combinations, permutations
+from collections.abc import Iterator, Sequence
+from itertools import chain, permutations
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx_nts.contact.search import apart, closest_facets
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.types import FloatArray
 
 #: Facets lie on each other up to this part of their size, with normals of this cosine or less.
@@ -36,10 +37,13 @@ def hidden_facets(contacts: Sequence[Any], u: Sequence[FloatArray]) -> tuple[int
         for pair, moved in zip(contacts, u, strict=True)
         if len(pair.bodies) == 2
     ]
+    of: dict[int, list[Any]] = {}
+    for one in masters:
+        of.setdefault(id(one[0].slave.body), []).append(one)
     count, text = 0, ""
-    for one, two in combinations(masters, 2):
+    for one, two in chain.from_iterable(map(_near_each_other, of.values())):
         bodies = one[0].slave.body, one[1].body, two[1].body
-        beside = one[0].slave.body is two[0].slave.body and len(set(map(id, bodies))) == 3
+        beside = len(set(map(id, bodies))) == 3
         for (pair, surface, x), (other, its, y) in permutations((one, two)) if beside else ():
             on = _lying_on(surface, x, its, y)
             if on.size and not text:
@@ -52,6 +56,17 @@ def hidden_facets(contacts: Sequence[Any], u: Sequence[FloatArray]) -> tuple[int
                 )
             count += len(on)
     return (count, text) if count else None
+
+
+def _near_each_other(masters: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
+    """Two and two masters of one slave whose boxes are as good as in touch."""
+    boxes = np.array([range_of(x) for _, _, x in masters])
+    sizes = (boxes[:, 0] + boxes[:, 1]).max(axis=1)
+    for i, one in enumerate(masters):
+        outside = -(boxes[i] + boxes[i + 1 :, ::-1]).min(axis=(1, 2))
+        near = outside < _ON * (sizes[i] + sizes[i + 1 :])
+        for j in np.flatnonzero(near):
+            yield one, masters[i + 1 + j]
 
 
 def _lying_on(

@@ -11,6 +11,7 @@ from dolfinx_nts.contact.contact_law import ContactLaw
 from dolfinx_nts.contact.contact_measure import Attachment, ContactMeasure, fixed_of
 from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
+from dolfinx_nts.contact.slip_friction import SlipFriction
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.types import FloatArray
 
@@ -21,6 +22,18 @@ def _moves(attachment: Attachment, foot: FloatArray) -> FloatArray:
     if attachment.shares is None:
         return weights
     return np.einsum("nk,nkp->np", weights, attachment.shares)
+
+
+def _varying(
+    pair: Any, attachment: Attachment, measure: ContactMeasure, step: Step
+) -> SlipFriction | None:
+    """What a pair's coefficient depends on, if on anything; edges press on a square of facets."""
+    if pair.friction_function is None:
+        return None
+    node = getattr(attachment, "node", None)
+    area = measure.length**2 if node is None else pair.slave.area[node]
+    dt = step.dt if step.integrator.inertia else 0.0
+    return SlipFriction(function=pair.friction_function, dt=dt, area=area, factor=step.factor)
 
 
 def elements_of(
@@ -50,6 +63,7 @@ def elements_of(
         row=3 * measure.start.shape[1] + measure.num_augmented,
         num_normal=measure.num_normal, scale=scale, yielding=scale / (1.0 + scale * ease),
         size=measure.length, prescribed=prescribed,
+        varies=_varying(pair, attachment, measure, step),
     )  # fmt: skip
     return ContactElements(
         pair=pair, candidates=found, attachment=attachment, measure=measure, law=law

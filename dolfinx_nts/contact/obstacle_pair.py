@@ -80,7 +80,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
     ) -> Found:
         """Candidates, as of `ContactPair`. Nothing limits the depth: what is behind is inside."""
         slave, reach = self.slave, 0.0 if motion is None else motion.reach
-        reach += self._lift
+        reach += self.lift
         x = positions[0][slave.share] - path[0]
         gap, length = self.obstacle.gap(x), np.sqrt(slave.area[slave.share])
         movable = ~slave.fixed[slave.share].all(axis=1)
@@ -89,7 +89,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         normal = gap.gradient[node, 0]
         left = gap.value[node] - self.offset[node]
         found = Candidates(node, only, only, xi, normal, left, length[node])
-        cover = reach - self._lift + MARGIN * float(np.sqrt(slave.area.min()))
+        cover = reach - self.lift + MARGIN * float(np.sqrt(slave.area.min()))
         return Found(found, np.ones(len(slave.share), dtype=bool), cover)
 
     def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from mpi4py import MPI
@@ -41,6 +42,22 @@ class _Looked:
     pause: Pause
 
 
+class _Everywhere(dict[int, FloatArray]):
+    """Forces of all points of a contact's slave by its number, (p,) each. Collective.
+
+    Args:
+        contacts: All, with their bodies.
+        histories: What each of them remembers.
+    """
+
+    def __init__(self, contacts: Sequence[Any], histories: Sequence[ContactHistory]) -> None:
+        self._contacts, self._histories = contacts, histories
+
+    def __missing__(self, k: int) -> FloatArray:
+        force: FloatArray = self._contacts[k][0].slave.at_all(self._histories[k].force)
+        return self.setdefault(k, force)
+
+
 class OverlapWatch:
     """Looks whether bodies that are in a contact with each other end up inside each other.
 
@@ -58,6 +75,7 @@ class OverlapWatch:
         self._edges: dict[int, InnerEdges] = {}
         self._corners = [(n, c) for n, c in enumerate(system.pairs) if isinstance(c, Corners)]
 
+        @cache
         def start() -> tuple[FloatArray, ...]:
             return system.initial_state().u
 
@@ -86,6 +104,11 @@ class OverlapWatch:
             *([o.contact.slave.body, None] for o in obstacles),
             *([self._bodies[k] for k in bodies] for bodies, _ in between),
         ]
+        # Of pairs of bodies, their numbers and a bound on the way since the last look [m].
+        self._between = np.array([bodies for bodies, _ in between], dtype=int).reshape(-1, 2)
+        self._ways = np.zeros(len(self._between))
+        self._last: Sequence[FloatArray] = ()
+        self._numbers = {id(c): k for k, c in enumerate(system.contacts)}
         # What the nodes of meshes miss each other by is no overlap.
         self._allowed = [
             *(o.contact.adjust for o in obstacles),
@@ -112,21 +135,18 @@ class OverlapWatch:
             edges: What the edges of each contact remember; left out with `contacts`.
             last: Look again wherever anything has moved.
         """
-        now = [pair.where(u, time) for pair in self._pairs]
         findings: list[Finding] = []
-        due = self._due(now, last)
-        # Obstacles have no rim and no inner edge.
-        between = [k for k, _ in due if isinstance(self._pairs[k], BodyPair)]
-        forces = self._everywhere(contacts) if between else []
-        for k, way in due:
+        forces = _Everywhere(self._contacts, contacts)
+        for k, where, way in self._due(u, time, last):
             before, pair = self._looked.get(k), self._pairs[k]
-            found, pause = pair.look(now[k])
+            found, pause = pair.look(where)
             if before and way > before.pause.clear + before.pause.through:
-                found += pair.passed(before.where, now[k], way, before.pause.through)
+                found += pair.passed(before.where, where, way, before.pause.through)
             findings += [f for f in found if f.depth > self._allowed[k]]
-            if forces and isinstance(pair, BodyPair):
+            # Obstacles have no rim and no inner edge.
+            if contacts and isinstance(pair, BodyPair):
                 findings += self._of_contacts(pair, u, forces, contacts, edges)
-            self._looked[k] = _Looked(now[k], pause)
+            self._looked[k] = _Looked(where, pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
             key = f.kind, f.about
@@ -134,16 +154,11 @@ class OverlapWatch:
                 worst[key] = f
         return list(worst.values())
 
-    def _everywhere(self, histories: Sequence[ContactHistory]) -> list[FloatArray]:
-        """Forces of all points of each contact's slave, none if there are none. Collective."""
-        both = zip(self._contacts, histories, strict=False)
-        return [contact.slave.at_all(history.force) for (contact, _), history in both]
-
     def _of_contacts(
         self,
         pair: BodyPair,
         u: Sequence[FloatArray],
-        everywhere: Sequence[FloatArray],
+        everywhere: _Everywhere,
         histories: Sequence[ContactHistory],
         edges: Sequence[EdgeHistory],
     ) -> Iterator[Finding]:
@@ -158,9 +173,11 @@ class OverlapWatch:
             histories: As `contacts` of `look`.
             edges: As of `look`.
         """
-        for k, (contact, bodies) in enumerate(self._contacts):
+        for contact in pair.contacts:
+            k = self._numbers[id(contact)]
+            bodies = self._contacts[k][1]
             # The surface of a contact of a body with itself may end where the body does not.
-            if contact not in pair.contacts or len(set(bodies)) < 2:
+            if len(set(bodies)) < 2:
                 continue
             carry = everywhere[k]
             if k in self._along:
@@ -178,16 +195,16 @@ class OverlapWatch:
                 in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
             ))  # fmt: skip
 
-    def _held_otherwise(self, k: int, forces: Sequence[FloatArray]) -> BoolArray:
+    def _held_otherwise(self, k: int, forces: _Everywhere) -> BoolArray:
         """Which points of contact k's slave carry in another contact, shape (p,).
 
         By the normal forces of all points of each contact's slave [N].
         """
         slave = self._contacts[k][0].slave
         held = np.zeros(len(slave.points), dtype=bool)
-        for n, ((contact, _), force) in enumerate(zip(self._contacts, forces, strict=True)):
+        for n, (contact, _) in enumerate(self._contacts):
             if n != k and contact.slave.body is slave.body:
-                held |= np.isin(slave.original, contact.slave.original[force > 0.0])
+                held |= np.isin(slave.original, contact.slave.original[forces[n] > 0.0])
         return held
 
     def enclosed(self, u: Sequence[FloatArray], time: float) -> list[Finding]:
@@ -200,25 +217,42 @@ class OverlapWatch:
         pairs = [pair for pair in self._pairs if isinstance(pair, ObstacleContact)]
         return [found for pair in pairs for found in pair.inside(pair.where(u, time))]
 
-    def _due(self, now: list[list[FloatArray]], last: bool) -> list[tuple[int, float]]:
-        """Pairs that have moved enough, and how far [m]. Collective."""
-        fresh = [(k, 0.0) for k in range(len(now)) if k not in self._looked]
-        if not self._looked:
-            return fresh
+    def _due(
+        self, u: Sequence[FloatArray], time: float, last: bool
+    ) -> list[tuple[int, list[FloatArray], float]]:
+        """Pairs that have moved enough, what is where, and how far they have [m]. Collective."""
+        first, last_ones = len(self._pairs) - len(self._between), self._last
+        if last_ones and len(self._between):
+            moved = np.array([
+                body.motion_range(now - before)
+                for body, now, before in zip(self._bodies, u, last_ones, strict=True)
+            ])  # fmt: skip
+            self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
+            self._ways += relative_way(moved[self._between])
+        self._last = u
+        fresh, near = [], []
+        for k, pair in enumerate(self._pairs):
+            looked = self._looked.get(k)
+            if looked is None:
+                fresh.append((k, pair.where(u, time), 0.0))
+            elif k < first or self._ways[k - first] > (0.0 if last else looked.pause.due):
+                near.append((k, looked, pair.where(u, time)))
         # Largest motion in each direction; the opposite ones are the least.
-        moved = np.full((len(self._looked), 2, 2, 3), -np.inf)
-        for i, (k, looked) in enumerate(self._looked.items()):
-            both = zip(self._movers[k], now[k], looked.where, strict=True)
+        moved = np.full((len(near), 2, 2, 3), -np.inf)
+        for i, (k, looked, where) in enumerate(near):
+            both = zip(self._movers[k], where, looked.where, strict=True)
             for j, (body, after, before) in enumerate(both):
                 change = after - before
                 # An obstacle has no body.
                 moved[i, j] = range_of(change) if body is None else body.motion_range(change)
         self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
-        ways = relative_way(moved).tolist()
         due = []
-        for (k, looked), way in zip(self._looked.items(), ways, strict=True):
-            if way > (0.0 if last else looked.pause.due):
-                due.append((k, way))
+        for (k, looked, where), way in zip(near, relative_way(moved).tolist(), strict=True):
+            looks = way > (0.0 if last else looked.pause.due)
+            if looks:
+                due.append((k, where, way))
+            if k >= first:
+                self._ways[k - first] = 0.0 if looks else way
         return fresh + due
 
 

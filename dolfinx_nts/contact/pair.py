@@ -14,6 +14,7 @@ import numpy as np
 
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.slave_choice import slave_and_master
+from dolfinx_nts.contact.slip_friction import at_rest
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
@@ -108,7 +109,9 @@ class ContactPair:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
         friction: Coulomb's coefficient mu [-], >= 0; above 1e6 it counts as 1e6, but infinite:
-            nodes in contact stick.
+            nodes in contact stick. Or a function of arrays (n,) of the speed of slip in the step
+            [m/s], 0 in statics, and of the pressure of each node's force over its area [Pa], which
+            returns positive coefficients, such as lambda v, p: 0.2 + 0.1 * np.exp(-v / 0.01).
         interference: What becomes of slave nodes that start inside the master by more than one part
             in a hundred of a facet. "refuse" them, or "resolve" it, as for a press fit: the load
             steps of `equilibrium` press nodes out that start up to half a facet deep, in proportion
@@ -131,7 +134,10 @@ class ContactPair:
         origin: Point of space that positions are relative to [m], shape (3,).
         extent: Largest of the reference positions' components, relative to it [m].
         given: Largest of the slave's as they were given, whose rounding they have [m].
+        friction_function: A function that was given for `friction`, which then is its value at rest
+            without pressure; else None.
         offset: Gap at the start that counts as none, of each slave node of `Surface.share` [m].
+        lift: The largest of them, or 0 [m]; alike on all ranks.
 
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
@@ -161,10 +167,10 @@ class ContactPair:
         return super().__new__(next(kinds, cls))
 
     def __init__(
-        self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse",
+        self, slave: Surface, master: Any, *, friction: Any = 0.0, interference: str = "refuse",
         adjust: float = 0.0, edges: bool = True, integration: str = "nodes",
     ) -> None:  # fmt: skip
-        _check_friction(friction)
+        rest = _at_rest(friction)
         require_bool("edges", edges)
         if not (is_finite(adjust) and adjust >= 0.0):
             raise ValueError(f"adjust={adjust!r}: pass a distance >= 0 [m]")
@@ -185,11 +191,17 @@ class ContactPair:
                 f"master={master!r}: pass a Surface, e.g. body.surface(marker), or a Plane, Sphere "
                 "or Cylinder"
             )
-        self.slave, self.friction, self.interference = slave, float(friction), interference
+        self.friction_function: Any = friction if callable(friction) else None
+        if callable(friction) and not self.holds_nodes:
+            raise ValueError(
+                f"friction={friction!r}: integration={integration!r} takes a number; use "
+                "integration='nodes'"
+            )
+        self.slave, self.friction, self.interference = slave, rest, interference
         self.master: Any = master
         self.edges, self.adjust, self.integration = edges, float(adjust), integration
         # Searches reach farther by the largest gap that counts as none.
-        self.offset, self._lift = np.zeros(len(slave.share)), 0.0
+        self.offset, self.lift = np.zeros(len(slave.share)), 0.0
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
@@ -303,7 +315,7 @@ class ContactPair:
 
     def settle(self, u: Sequence[FloatArray]) -> None:
         """Take the gaps at the start that count as none, see `offset`. Collective."""
-        self.offset, self._lift = np.zeros(len(self.slave.share)), 0.0
+        self.offset, self.lift = np.zeros(len(self.slave.share)), 0.0
         if not self.adjust:
             return
         found = self._at_start(self.positions(u), self.path(0.0, 0.0))
@@ -311,7 +323,7 @@ class ContactPair:
         near = np.abs(found.gap) <= self.adjust + rounding
         self.offset[found.node[near]] = found.gap[near]
         largest = np.array([self.offset.max(initial=0.0)])
-        self._lift = float(global_max(self.slave.body.comm, largest)[0])
+        self.lift = float(global_max(self.slave.body.comm, largest)[0])
 
     @property
     def settled(self) -> BoolArray:
@@ -423,7 +435,11 @@ class ContactPair:
         return surface.reference - self.origin + surface.gather(u)
 
 
-def _check_friction(friction: Any) -> None:
+def _at_rest(friction: Any) -> float:
+    """A coefficient as given, or what a function says without slip and pressure."""
+    if callable(friction):
+        return at_rest(friction)
     number = isinstance(friction, numbers.Real) and not isinstance(friction, bool)
     if not number or not float(friction) >= 0.0:
         raise ValueError(f"friction={friction!r}: pass a number >= 0 (math.inf: never slips)")
+    return float(friction)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.nodal_pressure import carried_areas
 from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray
 
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
@@ -54,27 +55,25 @@ def held_before(contacts: Sequence[ContactPair]) -> list[BoolArray]:
     return found
 
 
-def drop_doubles(found: list[ContactElements], forces: Sequence[FloatArray]) -> None:
+def drop_doubles(found: dict[int, ContactElements], histories: Sequence[ContactHistory]) -> None:
     """Keep one of two pairs that keep a node out of the same fixed surface.
 
     Two constraints on one gap are one too many where no master can yield, as over the seam of two
     plates. A node stays with the one that carried it.
 
     Args:
-        found: Candidates of each contact, which are replaced.
-        forces: Of each the normal forces of its nodes in the last step [N], shape (share,).
+        found: Candidates of contacts by their number, which are replaced.
+        histories: What each contact remembers of the last step.
     """
-    for i, j in combinations(range(len(found)), 2):
+    for i, j in _of_one_body({k: c.pair for k, c in found.items()}):
         a, b = found[i], found[j]
-        if a.pair.slave.body is not b.pair.slave.body:
-            continue
         one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
         _, ia, ib = np.intersect1d(one, two, return_indices=True)
         ca, cb = a.candidates.select(ia), b.candidates.select(ib)
         double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
         double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
         double &= a.immovable[ia] & b.immovable[ib]
-        stay = forces[i][ca.node] >= forces[j][cb.node]
+        stay = histories[i].force[ca.node] >= histories[j].force[cb.node]
         for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
             if len(there):
                 found[k] = c.select(~np.isin(np.arange(len(c.candidates.node)), there))
@@ -91,11 +90,18 @@ def areas(contacts: Sequence[ContactPair]) -> list[FloatArray]:
     return found
 
 
+def _of_one_body(contacts: Mapping[int, ContactPair]) -> list[tuple[int, int]]:
+    """Numbers of contacts whose slaves are of one body, two and two."""
+    of: dict[int, list[int]] = {}
+    for k, pair in contacts.items():
+        of.setdefault(id(pair.slave.body), []).append(k)
+    return sorted(both for each in of.values() for both in combinations(each, 2))
+
+
 def _beside(contacts: Sequence[ContactPair]) -> Iterator[tuple[int, int, str]]:
     """Pairs of contacts that share slave nodes and a master, in order, and what the master is."""
-    for i, j in combinations(range(len(contacts)), 2):
+    for i, j in _of_one_body(dict(enumerate(contacts))):
         one, two = contacts[i], contacts[j]
-        if one.slave.body is two.slave.body and np.isin(one.slave.points, two.slave.points).any():
-            what: Any = one.shares_master(two)
-            if what:
-                yield i, j, what
+        what: Any = one.shares_master(two)
+        if what and np.isin(one.slave.points, two.slave.points).any():
+            yield i, j, what

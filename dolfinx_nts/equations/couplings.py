@@ -19,10 +19,24 @@ from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Coupling, JointCoupling
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.interaction.measured import Measured, MeasuredPart, rubs
+from dolfinx_nts.interaction.measured import Measured, MeasuredPart, leans, rubs
 from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import FloatArray, IntArray
+
+
+class Load(NamedTuple):
+    """Whose multipliers a law depends on.
+
+    Attributes:
+        batch: Number of the batch that has them.
+        rows: Its elements on this rank, one of each element of the law's.
+        bearing: How many multipliers of each, the first ones.
+    """
+
+    batch: int
+    rows: IntArray
+    bearing: int
 
 
 class OfJoints(NamedTuple):
@@ -38,16 +52,13 @@ class Couplings:
     Attributes:
         contacts: What makes the elements of contacts. Used directly only for what contacts alone
             have: closing gaps, checkpoints.
-        edges: What makes those of edges, by the number of the contact.
         joints: What makes those of `System.joints`.
         mechanisms: How many groups of bodies joints link.
     """
 
     def __init__(self, system: System) -> None:
-        self.edges = {k: EdgeCoupling(edges) for k, edges in system.edges.items()}
-        self.contacts = ContactSearch(
-            system.pairs, system.pair_bodies, system.comm, self.edges
-        )
+        edges = {k: EdgeCoupling(own) for k, own in system.edges.items()}
+        self.contacts = ContactSearch(system.pairs, system.pair_bodies, system.comm, edges)
         self._contacts = len(system.contacts)
         both = zip(system.joints, system.joint_bodies, strict=True)
         each: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
@@ -61,24 +72,42 @@ class Couplings:
         linked = _linked(system.joint_bodies[:declared])
         self.mechanisms = max(linked, default=-1) + 1
         self._linked = [np.array([linked[k] for k in of if k < declared]) for _, of in self.joints]
+        self._loads = self._bearings(system)
         # Batches of elements of contacts and of edges in the step, which come first.
         self._touching = 0
 
+    def _bearings(self, system: System) -> dict[int, tuple[int, int, int]]:
+        """Number among `joints` of each law that depends on what its joint carries.
+
+        With the number of that joint, its place among those that are evaluated with it, and in how
+        many constraints it carries.
+        """
+        places = {
+            id(system.joints[n]): (k, row)
+            for k, (_, of) in enumerate(self.joints) for row, n in enumerate(of)
+        }  # fmt: skip
+        return {
+            k: (*places[id(law.of)], law.of.bearing)
+            for k, (_, (n, *_)) in enumerate(self.joints)
+            if leans(getattr(law := system.joints[n], "law", None))
+        }
+
     @property
     def _all(self) -> list[Coupling]:
-        return [self.contacts, *self.edges.values(), *(coupling for coupling, _ in self.joints)]
+        return [*self._of_contacts, *(coupling for coupling, _ in self.joints)]
+
+    @property
+    def _of_contacts(self) -> list[Coupling]:
+        return [self.contacts, *self.contacts.edges.values()]
 
     def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step; arguments as of `Coupling.begin`. Collective."""
         state = step.state
         self._remembered = state.contacts
-        for k, edges in self.edges.items():
-            edges.begin(step, state.edges[k], again, search)
         self.contacts.begin(step, state.contacts, again, search)
-        for edges in self.edges.values():
+        for edges in self.contacts.edges.values():
             edges.make()
-        own: list[Coupling] = [self.contacts, *self.edges.values()]
-        self._touching = sum(len(coupling.elements) for coupling in own)
+        self._touching = sum(len(coupling.elements) for coupling in self._of_contacts)
         for coupling, of in self.joints:
             coupling.begin(step, itemgetter(*of)(state.joints), again, search)
 
@@ -86,7 +115,7 @@ class Couplings:
     def elements(self) -> list[Any]:
         """Batches of elements in the step."""
         found: list[Any] = list(self.contacts.elements)
-        for edges in self.edges.values():
+        for edges in self.contacts.edges.values():
             found += edges.elements
         for coupling, _ in self.joints:
             found += coupling.elements
@@ -106,6 +135,34 @@ class Couplings:
                 several = len(linked) > 1
                 found.append(linked[batch.joint] if several else linked[0] if len(linked) else None)
         return found
+
+    @property
+    def loads(self) -> dict[int, Load]:
+        """Of the batches among `elements` whose laws depend on what their joints carry."""
+        if not self._loads:
+            return {}
+        starts = np.cumsum([self._touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
+        found = {}
+        for i, (k, row, bearing) in self._loads.items():
+            (batch,) = self.joints[k].coupling.elements
+            found[starts[i]] = Load(starts[k], np.flatnonzero(batch.joint == row), bearing)
+        return found
+
+    def tell_loads(self, own: Sequence[dict[str, FloatArray]]) -> None:
+        """Add to the unknowns of laws that depend on it what their joints carry.
+
+        That is "load", the force of a joint's bearing times the factor of the step, (n, bearing),
+        and "by_unknowns", its derivative by each of these unknowns, (n, 1).
+
+        Args:
+            own: Of each of `elements` its own unknowns, see `Unknowns.own_values`.
+        """
+        loads = self.loads
+        elements = self.elements if loads else []
+        for i, (k, rows, bearing) in loads.items():
+            scale = elements[k].scale[rows, None]
+            own[i]["load"] = scale * own[k]["constraints"][rows, :bearing]
+            own[i]["by_unknowns"] = scale
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""
@@ -128,7 +185,7 @@ class Couplings:
     def of_edges(self, e: Evaluation) -> Iterator[tuple[int, EdgeElements, Contribution]]:
         """Numbers of contacts whose edges are near each other, their elements and parts."""
         start = len(self.contacts.elements)
-        for k, coupling in self.edges.items():
+        for k, coupling in self.contacts.edges.items():
             for batch in coupling.elements:
                 part: Any = e.parts[start]
                 yield k, batch, part
@@ -146,7 +203,7 @@ class Couplings:
     def forget_solution(self) -> None:
         """Guess contact forces of t_n again, where those of a solution of the step led nowhere."""
         self.contacts.forget_solution()
-        for edges in self.edges.values():
+        for edges in self.contacts.edges.values():
             edges.forget_solution()
 
     def history(
@@ -159,9 +216,9 @@ class Couplings:
             for k, own in zip(of, found if len(of) > 1 else [found], strict=True):
                 out[k] = own
         contacts = self.contacts.history(e.parts[: len(self.contacts.elements)])
-        edges = [EdgeHistory.of_start() for _ in range(self._contacts)]
+        edges = [EdgeHistory.of_start()] * self._contacts
         for k, _, part in self.of_edges(e):
-            edges[k] = self.edges[k].history([part])
+            edges[k] = self.contacts.edges[k].history([part])
         return contacts, tuple(out), tuple(edges)
 
     def touching(

@@ -81,3 +81,14 @@ class ElementBlocks(NamedTuple):
     pattern: npt.NDArray[np.bool_]
     entries: npt.NDArray[np.bool_]
     weights: npt.NDArray[np.float64] | None = None
+
+    def with_columns(self, field: int, numbers: IntArray) -> ElementBlocks:
+        """With unknowns of others, (n, columns), on which all rows may depend."""
+        size, more = len(self.pattern), numbers.shape[1]
+        wide = [np.zeros((size + more,) * 2, dtype=bool) for _ in range(2)]
+        for new, old in zip(wide, (self.pattern, self.entries), strict=True):
+            new[:size, :size], new[:size, size:] = old, True
+        return self._replace(
+            fields=(*self.fields, field), columns=(*self.columns, np.arange(size, size + more)),
+            numbers=(*self.numbers, numbers), pattern=wide[0], entries=wide[1],
+        )

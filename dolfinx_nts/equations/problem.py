@@ -232,7 +232,8 @@ class StepProblem:
         if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
             of = self.couplings.bodies
-            self.unknowns = Unknowns(self.batches, self.awake, elements, of)
+            loads = self.couplings.loads
+            self.unknowns = Unknowns(self.batches, self.awake, elements, of, loads)
             self.version += 1
             self._numbers = numbers
         self._of_none = None
@@ -323,6 +324,7 @@ class StepProblem:
         laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
+        self.couplings.tell_loads(own)
         parts = evaluate_together(self.system.comm, elements, positions, own)
         contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)
         self._shared.divide(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ class Unknowns:
         awake: Numbers of the bodies in the step, the same on all ranks, in order.
         elements: Batches of elements.
         bodies: Numbers of the bodies of each batch, see `Batches.batch_of`.
+        loads: Multipliers of others that laws of batches depend on, as of `Couplings.loads`; their
+            columns follow all others in the tangents.
 
     Attributes:
         awake: Numbers of the batches of bodies with bodies in the step: one field each.
@@ -43,6 +46,7 @@ class Unknowns:
         awake: Sequence[int],
         elements: Sequence[Any],
         bodies: Sequence[tuple[int, ...]],
+        loads: Mapping[int, Any] = MappingProxyType({}),
     ) -> None:
         comm = batches.comm
         self._batches = batches
@@ -67,7 +71,7 @@ class Unknowns:
             + [place.start + batches.bodies[j].fixed for j, place in self._places.items()]
         )
         self._parts: dict[int, Any] = {}
-        self.blocks = self._blocks(elements, bodies) if there[-1] else []
+        self.blocks = self._blocks(elements, bodies, loads) if there[-1] else []
         index, owners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for c, numbers in zip(elements, bodies, strict=True):
             if c.num_elements:
@@ -98,12 +102,14 @@ class Unknowns:
         return np.where(own < 0, own, self.layout.to_system(field, own))
 
     def _blocks(
-        self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]]
+        self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]], loads: Mapping[int, Any]
     ) -> list[ElementBlocks]:
         """Numbers of the elements' unknowns in their fields."""
         blocks = []
+        sizes = [_size(c, "constraints") for c in elements]
+        starts = np.cumsum([0, *sizes]).tolist()
         offset = {name: self.layout.start(f) for name, f in self.own.items()}
-        for c, of in zip(elements, bodies, strict=True):
+        for i, (c, of) in enumerate(zip(elements, bodies, strict=True)):
             if not all(self._batches.batch_of(b) in self._field for b in of):
                 none = np.empty((0, 0), dtype=bool)
                 blocks.append(ElementBlocks((), (), (), none, none))
@@ -133,6 +139,13 @@ class Unknowns:
             block = ElementBlocks(
                 fields, tuple(columns), tuple(numbers), pattern, entries, weights
             )
+            if i in loads:
+                k, rows, bearing = loads[i]
+                width, start = elements[k].widths["constraints"], starts[k]
+                first = self.layout.start(self.own["constraints"]) + start + width * rows
+                block = block.with_columns(
+                    self.own["constraints"], first[:, None] + np.arange(bearing)
+                )
             blocks.append(block)
         return blocks
 

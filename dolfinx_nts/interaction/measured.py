@@ -37,6 +37,7 @@ class MeasuredPart(NamedTuple):
         memory: The measure at t_{n+1}, and with a multiplier D and where the measure began, shape
             (n, 1) or (n, 3).
         work: Of the force against the motion of the step [J], shape (n,).
+        law: As it was obeyed.
     """
 
     residual: FloatArray
@@ -44,6 +45,7 @@ class MeasuredPart(NamedTuple):
     status: BoolArray
     memory: FloatArray
     work: FloatArray
+    law: Any
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,7 +109,11 @@ class MeasuredElements(PointElements):
         """Residual and tangent."""
         measure, theta, n = self.measure, self.step.integrator.taken_at, len(x)
         rate, factor = self.step.moments[0].rate, self.step.factor
-        du, held = x - self.y0, holds(self.law)
+        du, held, law = x - self.y0, holds(self.law), self.law
+        leaning = leans(law)
+        if leaning:
+            load = np.linalg.norm(own["load"], axis=1)
+            law = law.under(load / factor)
         end = measure.vectors(x)
         if theta is None:
             (a, b), at_a = (self._start, end), self.near
@@ -133,7 +139,7 @@ class MeasuredElements(PointElements):
                 time=self.step.dt if theta is None else None,
                 when=start + (0.5 if theta is None else theta) * self.step.dt,
             )
-            both = zip(self.law.pull(move), (n, gradient.mean.shape), strict=True)
+            both = zip(law.pull(move), (n, gradient.mean.shape), strict=True)
             pull, slope = (np.broadcast_to(np.asarray(f, dtype=float), form) for f, form in both)
             status, memory = np.empty((0, n), dtype=bool), at_end[:, None]
             ends, of_row = none, (none,) * 4
@@ -141,7 +147,7 @@ class MeasuredElements(PointElements):
             length, unit = measure.length, self.force_scale
             force = own["constraints"][:, 0]
             pull, slope = unit / factor * force, np.zeros_like(gradient.mean)
-            row = self.law.row(length * self.since, length * at_end, force, unit / factor)
+            row = law.row(length * self.since, length * at_end, force, unit / factor)
             ends = gradient.end
             if theta is not None:
                 ends = measure.kind.gradient(end, end, at_end, at_end).end
@@ -151,9 +157,13 @@ class MeasuredElements(PointElements):
             library.load().forces_along, size // 3, a.shape[1], held, share, factor, n,
             measure.weights, *gradient[:2], ends, pull, slope, *of_row, du, residual, tangent, work,
         )  # fmt: skip
+        if leaning:
+            across = own["load"] / np.maximum(load, TINY)[:, None] * own["by_unknowns"]
+            slope = self.scale * row.by_bound * law.by_load / self.force_scale
+            tangent = _widened(tangent, slope[:, None] * across)
         if held and not self.step.integrator.inertia:
             work = pull * (at_end - self.since)
-        return MeasuredPart(residual, tangent, status, memory, work)
+        return MeasuredPart(residual, tangent, status, memory, work, law)
 
     @cached_property
     def _start(self) -> FloatArray:
@@ -195,9 +205,22 @@ class MeasuredElements(PointElements):
         return float(size[k]), f"{text}, flips {times} times" if times else text
 
 
+def leans(law: Any) -> bool:
+    """Whether a law depends on what its joint carries."""
+    return bool(getattr(law, "by_load", 0.0))
+
+
 def rubs(coupling: Any) -> TypeGuard[Measured]:
     """Whether a coupling is of a law that sticks and slips, see `Rubs`."""
     return isinstance(coupling, Measured) and hasattr(coupling.law, "blurred")
+
+
+def _widened(tangent: FloatArray, across: FloatArray) -> FloatArray:
+    """A tangent (n, r, r) with more columns, (n, c) of which are those of its last row."""
+    (n, size, _), more = tangent.shape, across.shape[1]
+    wide = np.zeros((n, size + more, size + more))
+    wide[:, :size, :size], wide[:, size - 1, size:] = tangent, across
+    return wide
 
 
 class Measured(EveryStep):

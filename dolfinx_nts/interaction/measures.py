@@ -128,12 +128,15 @@ class Row(NamedTuple):
         by_end: Its derivative by the measure at t_{n+1}.
         by_force: Its derivative by the force.
         status: What Newton's iterations may flip.
+        by_bound: Its derivative by the bound over `unit`, of a law whose bound follows from what
+            its joint carries.
     """
 
     value: FloatArray
     by_end: FloatArray
     by_force: FloatArray
     status: BoolArray
+    by_bound: FloatArray | None = None
 
 
 class HoldingLaw(Protocol):

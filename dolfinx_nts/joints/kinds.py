@@ -73,6 +73,8 @@ class Spherical(Between):
 class _WithAxis(Between):
     """A joint with an axis n, and directions m1 and m2 at right angles, at both ends.
 
+    Its first `bearing` multipliers are the forces by which its friction may be given.
+
     Args:
         a: A body, or None.
         b: A body, or None.
@@ -90,6 +92,7 @@ class _WithAxis(Between):
         name: str | None = None,
     ) -> None:
         super().__init__(a, b, ("point", point, point), name)
+        self.bearing = 2
         self.axis = direction(f"axis of {self.name!r}", axis)
         axes = triad(self.axis)
         (self.m1_a, self.m2_a, self.n_a), (self.m1_b, self.m2_b, self.n_b) = self.directions(axes)
@@ -151,6 +154,7 @@ class Revolute(_WithAxis):
         name: str | None = None,
     ) -> None:
         super().__init__(a, b, point=point, axis=axis, name=name)
+        self.bearing = 3
         if angle is not None:
             self.drive("angle", angle, "rad", number_at)
         self.parts = laws_on(self, friction, limits, motor, turns=True)

@@ -36,19 +36,49 @@ _APART = float(np.finfo(float).eps) ** (1 / 3)
 @known_options
 @dataclass(frozen=True, kw_only=True)
 class JointFriction:
-    """Dry friction in a joint, whatever the joint carries.
+    """Dry friction in a joint: up to a bound whatever the joint carries, or by what it carries.
 
     Attributes:
-        bound: Torque [N m], or force [N] along a prismatic joint's axis, up to which it sticks.
+        bound: Torque [N m], or force [N] along an axis, up to which it sticks.
+        coefficient: Of friction mu [-], in place of `bound`: it sticks up to mu R, or the torque
+            mu r R, with R the force of the joint's bearing in the step: of a revolute joint on its
+            point, of what slides along an axis that at right angles to this. Moments that a bearing
+            carries add nothing.
+        radius: Of the pin, r [m]; of what turns.
 
     Raises:
-        ValueError: bound is not positive.
+        ValueError: A number is not positive, or neither or both of bound and coefficient are given,
+            or a radius without coefficient.
     """
 
-    bound: float
+    bound: float | None = None
+    coefficient: float | None = None
+    radius: float | None = None
 
     def __post_init__(self) -> None:
-        require_positive("bound", self.bound, "N m or N")
+        for name, unit in (("bound", "N m or N"), ("coefficient", ""), ("radius", "m")):
+            if getattr(self, name) is not None:
+                require_positive(name, getattr(self, name), unit)
+        if (self.bound is None) == (self.coefficient is None):
+            raise ValueError(
+                f"bound={self.bound!r}, coefficient={self.coefficient!r}: pass one of both"
+            )
+        if self.bound is not None and self.radius is not None:
+            raise ValueError(f"radius={self.radius!r}: goes with coefficient=, not with bound=")
+
+    def law(self, name: str, turns: bool) -> Bound:
+        """The law of an argument of this name, on an angle or a way.
+
+        Raises:
+            ValueError: The radius is missing, or is given where nothing turns.
+        """
+        if self.bound is not None:
+            return Bound(float(self.bound))
+        assert self.coefficient is not None
+        if turns != (self.radius is not None):
+            what = "pass the pin's radius=, too" if turns else "what slides has no radius; drop it"
+            raise ValueError(f"{name}={self!r}: {what}")
+        return Bound(0.0, float(self.coefficient * (self.radius or 1.0)))
 
 
 class Bound(NamedTuple):
@@ -56,18 +86,24 @@ class Bound(NamedTuple):
 
     Attributes:
         bound: Of D, a number or of each element, shape (n,).
+        by_load: Its derivative by the force that the bearing carries.
         width: As of `Rubs.blurred`; 0: the law itself.
         held: As of `Rubs.parted`; None: as the law says.
     """
 
     bound: Any
+    by_load: float = 0.0
     width: float = 0.0
     held: BoolArray | None = None
 
     @property
-    def alike(self) -> Hashable:
-        """All are."""
-        return ()
+    def alike(self) -> Hashable | None:
+        """All are whose bounds are given."""
+        return None if self.by_load else ()
+
+    def under(self, load: FloatArray) -> Bound:
+        """With the bound that a load (n,) [N] gives."""
+        return self._replace(bound=self.by_load * load)
 
     @classmethod
     def together(cls, laws: Sequence[Bound], counts: Sequence[int]) -> Bound:
@@ -78,7 +114,7 @@ class Bound(NamedTuple):
     @property
     def settings(self) -> Mapping[str, Any]:
         """The bound."""
-        return {"bound": self.bound}
+        return {"by_load": self.by_load} if self.by_load else {"bound": self.bound}
 
     def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: FloatArray) -> Row:
         """Stick c_1 = c_0, or D = bound sign(c_1 - c_0), by the trial D + c_1 - c_0."""
@@ -90,10 +126,12 @@ class Bound(NamedTuple):
             # bound in the slope.
             size = np.hypot(slip, self.width)
             slope = (np.clip(force, -most, most) * slip / size - most) / size
-            return Row(force - most * slip / size, slope, np.ones_like(slip), stick)
+            return Row(
+                force - most * slip / size, slope, np.ones_like(slip), stick, -slip / size
+            )
         slides = force - most * np.sign(trial)
         on, off = stick.astype(float), (~stick).astype(float)
-        return Row(np.where(stick, slip, slides), on, off, stick)
+        return Row(np.where(stick, slip, slides), on, off, stick, -off * np.sign(trial))
 
     def blurred(self, width: float) -> Bound:
         """D = bound s/sqrt(s^2 + width^2) of the slip s."""
@@ -105,7 +143,9 @@ class Bound(NamedTuple):
 
     def unlike(self, slip: FloatArray, pull: FloatArray, width: float) -> FloatArray:
         """What D misses of the blurred law, over its bound."""
-        return pull / self.bound - slip / np.hypot(slip, width)
+        bound = np.broadcast_to(self.bound, pull.shape)
+        part = np.divide(pull, bound, out=np.zeros_like(pull), where=bound > 0.0)
+        return np.where(bound > 0.0, part - slip / np.hypot(slip, width), 0.0)
 
 
 class Limits(NamedTuple):
@@ -179,7 +219,8 @@ class OnJoint(AlongMeasure):
     """A law on a measure of a joint.
 
     Args:
-        joint: The joint.
+        joint: The joint; of one with an axis and friction by its load the first constraints are
+            those whose multipliers are the components of this, `bearing` of them.
         word: What it is, for its name.
         law: The law.
         entry: As of `AlongMeasure`.
@@ -193,6 +234,8 @@ class OnJoint(AlongMeasure):
         kind: Any, vectors: Iterable[Any], length: float,
     ) -> None:  # fmt: skip
         super().__init__(joint.ends, f"{joint.name} {word}")
+        # Where the joint is, whose forces it may depend on.
+        self.of, self._here, self.numbers = joint, joint._here, joint.numbers
         self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
         self.law, self.entry = law, entry
 
@@ -225,8 +268,12 @@ def laws_on(
     found: list[tuple[str, Any, tuple[str, float]]] = []
     if friction is not None:
         if not isinstance(friction, JointFriction):
-            raise TypeError(f"{names[0]}={friction!r}: pass nts.JointFriction(bound=...)")
-        found.append((names[0], Bound(float(friction.bound)), ("friction_dissipation", 1.0)))
+            raise TypeError(
+                f"{names[0]}={friction!r}: pass nts.JointFriction(bound=...), or "
+                "nts.JointFriction(coefficient=..., radius=...)"
+            )
+        law = friction.law(names[0], turns)
+        found.append((names[0], law, ("friction_dissipation", 1.0)))
     if limits is not None:
         both = measure[2] * np.array(_both(names[1], limits))
         found.append((names[1], Limits(*both.tolist()), ("contact_defect", 1.0)))

@@ -33,6 +33,9 @@ class Law(NamedTuple):
         tangential_scale: Algorithmic scale of the return map, shape (n,).
         unmoved: Projector on what of lambda_T acts on prescribed coordinates only, shape
             (n, 2, 2); None: nothing is prescribed.
+        coefficients: Of friction, of each pair in place of `coefficient`, shape (n,); or None.
+        by_slip: Their derivatives by the distance of the slip [1/m].
+        by_force: By the force that presses [1/(kg m)].
     """
 
     scale: FloatArray
@@ -52,6 +55,9 @@ class Law(NamedTuple):
     hardly: float = 0.0
     tangential_scale: FloatArray | None = None
     unmoved: FloatArray | None = None
+    coefficients: FloatArray | None = None
+    by_slip: FloatArray | None = None
+    by_force: FloatArray | None = None
 
     def structure(self) -> tuple[Any, list[Any]]:
         """What the kernel takes, and the arrays that it points to."""

@@ -7,12 +7,13 @@
 /* ---- the laws */
 
 /* What the pairs have in common, and what each has of its own in a step; `before` is NULL without
-   massless nodes, `unmoved` where nothing is prescribed. */
+   massless nodes, `unmoved` where nothing is prescribed, `coefficients` with their derivatives by the
+   distance of the slip and by the force that presses unless each pair has a coefficient of its own. */
 typedef struct {
     const double *scale, *yielding, *none, *before;
     int size, row, friction, endless, strong, redundant;
     double coefficient, pull, uneven, opening, hardly;
-    const double *tangential_scale, *unmoved;
+    const double *tangential_scale, *unmoved, *coefficients, *by_slip, *by_force;
 } Law;
 
 typedef struct {
@@ -117,6 +118,24 @@ static void rub_hardly(const Law *law, const Slip *slip, const double *end, doub
     }
 }
 
+/* Add to a row what follows from the change of the coefficient with slip and force; `by` is the derivative of the row
+   by the coefficient. */
+static void follow(int size, const Slip *slip, double by, double by_slip, double by_force, double *row, int normal)
+{
+    const double *m = slip->metric, *s = slip->value;
+    double distance = distance_of(slip);
+    row[normal] -= by * by_force;
+    for (int z = 0; distance > 0.0 && z < size; z++) {
+        double along = 0.0;
+        for (int a = 0; a < 2; a++) {
+            along += (m[2 * a] * s[0] + m[2 * a + 1] * s[1]) * slip->gradient[a * size + z];
+            for (int b = 0; b < 2; b++)
+                along += 0.5 * s[a] * s[b] * slip->metric_gradient[(2 * a + b) * size + z];
+        }
+        row[z] += by * by_slip * along / distance;
+    }
+}
+
 /* The rows of lambda_T of an active pair by Coulomb's law for the trial t + c m s (theory 6): it sticks within the
    bound, else it slips along the trial. Returned is whether it sticks.
 
@@ -124,7 +143,7 @@ static void rub_hardly(const Law *law, const Slip *slip, const double *end, doub
    gap asks for, as in the active set. With a bound of zero the pair would have to slip at first, by the slope of the
    bound, which is mu for all active pairs. Points of a rigid body that rest would go on so, by rounding and against
    each other. */
-static int rub(const Law *law, const Together *together, const Slip *slip, const double *end, double of_end,
+static int rub(const Law *law, long i, const Together *together, const Slip *slip, const double *end, double of_end,
                double scale, double yielding, double c, const double *unmoved, const double *held, double *residual,
                double *tangent)
 {
@@ -133,7 +152,7 @@ static int rub(const Law *law, const Together *together, const Slip *slip, const
     const double *by_gap = tangent + law->row * law->size;
     int size = law->size, last = size - 2, stick;
     int new = end[0] >= 0.0 && (law->strong || law->redundant);
-    double mu = law->coefficient, *value = residual + last, *rows = tangent + last * size;
+    double mu = law->coefficients ? law->coefficients[i] : law->coefficient, *value = residual + last, *rows = tangent + last * size;
     double bound = mu * (law->strong ? -end[0] : larger(-end[0], 0.0)), loose[4], less[2], trial[2];
     if (new)
         bound -= mu * yielding * residual[law->row];
@@ -176,6 +195,8 @@ static int rub(const Law *law, const Together *together, const Slip *slip, const
             row[law->row] -= mu * of_end * by_bound[a];
             for (int z = 0; new && z < size; z++)
                 row[z] -= mu * yielding * by_bound[a] * by_gap[z];
+            if (law->coefficients && !law->endless)
+                follow(size, slip, by_bound[a] * bound / mu, law->by_slip[i], law->by_force[i], row, law->row);
             value[a] /= scale;
             for (int z = 0; z < size; z++)
                 row[z] /= scale;
@@ -238,7 +259,7 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
             if (law->hardly > 0.0)
                 rub_hardly(law, &slip, last, of_end, scale, law->yielding[i], r, k);
             else if (law->friction)
-                stick[i] = rub(law, together, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
+                stick[i] = rub(law, i, together, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
                                unmoved ? held + 4 * i : NULL, r, k);
         } else {
             r[row] = last[0] / scale;

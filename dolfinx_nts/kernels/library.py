@@ -61,6 +61,7 @@ class Law(ctypes.Structure):
         *((name, _INT) for name in ("size", "row", "friction", "endless", "strong", "redundant")),
         *((name, _REAL) for name in ("coefficient", "pull", "uneven", "opening", "hardly")),
         *((name, _ARRAY) for name in ("tangential_scale", "unmoved")),
+        *((name, _ARRAY) for name in ("coefficients", "by_slip", "by_force")),
     ]
 
 

@@ -27,11 +27,13 @@ class ContactLoads(NamedTuple):
     """Contact forces of a step, as its elements have them.
 
     Attributes:
-        elements: Those of each contact: of nodes, and of corners and edges that are near.
+        contacts: Those of the system.
+        elements: Those of each contact: of nodes, corners and edges that are near.
         parts: Their solution.
         factor: What the step equations multiply forces by [s^2].
     """
 
+    contacts: tuple[ContactPair, ...]
     elements: tuple[tuple[Any, ...], ...]
     parts: tuple[tuple[Any, ...], ...]
     factor: float
@@ -47,19 +49,20 @@ class ContactLoads(NamedTuple):
             both[k].append((c, part))
         elements = tuple(tuple(c for c, _ in of) for of in both)
         parts = tuple(tuple(p._replace(tangent=np.empty(0)) for _, p in of) for of in both)
-        return cls(elements, parts, problem.factor)
+        return cls(problem.system.contacts, elements, parts, problem.factor)
 
     def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
         """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""
-        both, found = zip(self.elements[k], self.parts[k], strict=True), []
-        pair, forces_of = self.elements[k][0].pair, [c.nodal_forces(part) for c, part in both]
-        # Corners are the master's.
-        of = [
-            forces if c.pair is pair else forces[::-1]
-            for c, forces in zip(self.elements[k], forces_of, strict=True)
-        ]
-        for surface, forces in zip(pair.surfaces, zip(*of, strict=True), strict=True):
-            force = sum(forces[1:], forces[0])
+        pair, found = self.contacts[k], []
+        total = [np.zeros((len(surface.points), 3)) for surface in pair.surfaces]
+        for c, part in zip(self.elements[k], self.parts[k], strict=True):
+            forces = c.nodal_forces(part)
+            # Corners are the master's.
+            for all_forces, own in zip(
+                total, forces if c.pair is pair else forces[::-1], strict=True
+            ):
+                all_forces += own
+        for surface, force in zip(pair.surfaces, total, strict=True):
             surface.body.comm.Allreduce(MPI.IN_PLACE, force, op=MPI.SUM)
             found.append((surface, force / self.factor))
         return found
@@ -73,11 +76,12 @@ class ContactLoads(NamedTuple):
             k: Number of the contact.
             force: Those of its law, shape (share,).
         """
-        contact = self.elements[k][0]
-        found = contact.pressing(self.parts[k][0])
+        # Surfaces that are integrated over have neither corners nor others of their kind.
+        both = zip(self.elements[k], self.parts[k], strict=True)
+        found = next((c.pressing(part) for c, part in both), None)
         if found is None:
             return force
-        slave = contact.pair.slave
+        slave = self.contacts[k].slave
         slave.body.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.SUM)
         return found[slave.share] / self.factor
 

@@ -166,7 +166,9 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
         (k, batch, part, old.force[batch.candidates.node] > 0.0)
         for k, batch, part, old in couplings.touching(step)
     ]
-    edges = [(k, c, part, couplings.edges[k].pressed) for k, c, part in couplings.of_edges(step)]
+    edges = [
+        (k, c, part, couplings.contacts.edges[k].pressed) for k, c, part in couplings.of_edges(step)
+    ]
     for k, batch, part, pressed in (*nodes, *edges):
         new = part.active & ~pressed
         force = np.where(new, -part.multiplier[:, 0], 0.0)

@@ -62,8 +62,8 @@ class RubbingJoints:
         slip = np.concatenate(slips)
         if self._blurs:
             missed = [
-                np.abs(batch.law.unlike(own, part.memory[:, 1], self._width)).max(initial=0.0)
-                for batch, own, part in zip(batches, slips, parts, strict=True)
+                np.abs(part.law.unlike(own, part.memory[:, 1], self._width)).max(initial=0.0)
+                for own, part in zip(slips, parts, strict=True)
             ]
             if not anywhere(comm, max(missed) > _NEAR):
                 if self._has_parted(slip):

@@ -385,6 +385,7 @@ def laws_in_joints(frame):
         nts.Revolute(
             arms[1], arms[0], point=frame.place(1, 0, 0), axis=axis, name="elbow",
             limits=(-0.005, 0.005),
+            friction=nts.JointFriction(coefficient=0.2, radius=frame.size(0.05, 1)),
         ),
     ]  # fmt: skip
     weights = [

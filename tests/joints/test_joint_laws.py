@@ -5,6 +5,8 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from integrators import ACCELERATED, MID_STEP
+from measures import dense, differences, relative
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, lsq_linear
 
 import dolfinx_nts as nts
@@ -13,6 +15,8 @@ from dolfinx_nts.interaction.measured import Measured
 COMM = MPI.COMM_WORLD
 G = 9.81
 MASS, ARM, INERTIA = 1.5, 0.5, 0.2
+#: Of small swings of a pendulum.
+PERIOD = 2 * np.pi * np.sqrt((0.1 + MASS * ARM**2) / (MASS * G * ARM))
 rules = pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)
 pytestmark = pytest.mark.mpi
 
@@ -34,6 +38,12 @@ def pendulum(**laws):
     )
     hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 1, 0), name="hinge", **laws)
     return body, nts.System([body], joints=[hinge], gravity=(0, 0, -G))
+
+
+def pin(friction, argument):
+    """Of a rod along z in a sleeve."""
+    rod = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="rod")
+    return nts.Cylindrical(rod, None, point=(0, 0, 0), axis=(0, 0, 1), **{argument: friction})
 
 
 def slider(tilt, speed=0.0, **laws):
@@ -328,8 +338,18 @@ def test_laws_that_let_go_ask_for_another_integrator(rule):
 def test_wrong_laws(laws, error, text):
     with pytest.raises(error, match=text):
         disc(0.0, **laws)
-    with pytest.raises(ValueError, match="bound=0.0: must be"):
-        nts.JointFriction(bound=0.0)
+    for given, text in (
+        ({"bound": 0.0}, "bound=0.0: must be"),
+        ({}, "bound=None, coefficient=None: pass one of both"),
+        ({"bound": 1.0, "coefficient": 0.1}, "pass one of both"),
+        ({"bound": 1.0, "radius": 0.1}, "radius=0.1: goes with coefficient="),
+    ):
+        with pytest.raises(ValueError, match=text):
+            nts.JointFriction(**given)
+    with pytest.raises(ValueError, match="turning_friction=.*: pass the pin's radius=, too"):
+        pin(nts.JointFriction(coefficient=0.1), "turning_friction")
+    with pytest.raises(ValueError, match="sliding_friction=.*: what slides has no radius"):
+        pin(nts.JointFriction(coefficient=0.1, radius=0.1), "sliding_friction")
     wrong = [(0, 0, 1), ((0, 0, 1), 0.0), ((0, 0, 1), 4.0), 0.5, ((0, 0, 1), "far")]
     for given in wrong:
         body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="a")
@@ -410,3 +430,121 @@ def test_laws_that_are_alike_do_what_each_does_alone(rule, monkeypatch):
         if b is not None:
             assert a.shape == b.shape
             assert np.abs(a - b).max(initial=0.0) <= 1e-9 * most
+
+
+def swings(friction, start, parts, steps):
+    """Of a pendulum let go at an angle from its lowest place: angles, and the table."""
+    centre = ARM * np.array([np.sin(start), 0, -np.cos(start)])
+    body = nts.RigidBody.from_inertia(MASS, (0.01, 0.1, 0.1), centre=centre, name="arm")
+    hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 1, 0), friction=friction)
+    system = nts.System([body], joints=[hinge], gravity=(0, 0, -G))
+    stepper, found = nts.Stepper(system, nts.EnergyMomentum()), [start]
+    for _ in range(steps):
+        stepper.advance(PERIOD / parts)
+        found.append(np.arctan2(body.position[0], -body.position[2]))
+    table = stepper.solution.balance
+    lost = table["friction_dissipation"]
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * MASS * G * ARM
+    assert (np.diff(lost) >= 0.0).all()
+    return np.array(found), table
+
+
+def test_friction_of_a_pin_stops_a_pendulum():
+    """Of small swings the amplitude falls by 2 mu r/L each half, as m g L (A^2 - B^2)/2 is lost to
+    mu r m g (A + B); it stops where m g L A is less than mu r m g.
+    """
+    part, first, radius = 5e-3, 0.0525, 0.05
+    pin = nts.JointFriction(coefficient=part * ARM / radius, radius=radius)
+    angles, _ = swings(pin, first, 40, 125)
+    ends = first - 2 * part * np.arange(6)
+    assert np.abs(angles[:101:20]) == pytest.approx(ends, abs=4e-3 * first)
+    assert np.ptp(angles[105:]) < 1e-12
+
+
+@pytest.mark.parametrize("reach", [0.02, 0.2])
+def test_friction_of_a_pin_takes_the_reaction_of_its_step(reach):
+    """A wide swing, mu r/L = `reach`, against its equation by SciPy: of second order.
+
+    The reaction has the acceleration in it, on which friction acts.
+    """
+    turned = 0.1 + MASS * ARM**2
+
+    def rates(_, y):
+        angle, rate = y
+        weight, across = MASS * G * np.sin(angle), MASS * (ARM * rate**2 + G * np.cos(angle))
+
+        def missed(bend):
+            load = np.hypot(MASS * ARM * bend + weight, across)
+            return turned * bend + ARM * weight - reach * ARM * load
+
+        return rate, brentq(missed, -1e3, 1e3, xtol=1e-14)
+
+    start, end = 1.2, 0.3 * PERIOD
+    exact = solve_ivp(rates, (0.0, end), (start, 0.0), rtol=1e-11, atol=1e-13).y[0, -1]
+    pin = nts.JointFriction(coefficient=reach * ARM / 0.05, radius=0.05)
+    errors = [abs(swings(pin, start, 10 * n, 3 * n)[0][-1] - exact) for n in (4, 8)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_friction_of_a_rail_by_what_it_carries():
+    """A slider on a slope: a = g (sin - mu cos), or it sticks."""
+    tilt, mu = 0.5, 0.3
+    body, axis, system = slider(tilt, friction=nts.JointFriction(coefficient=mu))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=0.4)
+    assert_closed(run)
+    way = 0.5 * G * (np.sin(tilt) - mu * np.cos(tilt)) * 0.4**2
+    assert body.position @ axis == pytest.approx(way, rel=1e-10)
+    body, axis, system = slider(np.arctan(0.99 * mu), friction=nts.JointFriction(coefficient=mu))
+    nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=0.4)
+    assert abs(body.position @ axis) < 1e-12
+
+
+def test_each_pin_takes_the_load_of_its_own_joint():
+    """Two pendulums whose joints are evaluated together move as each does alone."""
+
+    def run(coefficients):
+        bodies, hinges = [], []
+        for k, coefficient in coefficients.items():
+            bodies.append(nts.RigidBody.from_inertia(
+                MASS * k, (0.01, 0.1, 0.1), centre=(ARM, k, 0), name=f"arm {k}"
+            ))  # fmt: skip
+            friction = nts.JointFriction(coefficient=coefficient, radius=0.05)
+            hinges.append(nts.Revolute(
+                bodies[-1], None, point=(0, k, 0), axis=(0, 1, 0), friction=friction
+            ))  # fmt: skip
+        system = nts.System(bodies, joints=hinges, gravity=(0, 0, -G))
+        assert nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=0.2).status == "completed"
+        return {k: angle(body) for k, body in zip(coefficients, bodies, strict=True)}
+
+    both = run({1: 0.4, 2: 0.8})
+    alone = run({1: 0.4}) | run({2: 0.8})
+    assert both == pytest.approx(alone, abs=1e-12)
+    assert abs(both[1] - both[2]) > 1e-3
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+def test_the_tangent_knows_the_load_of_a_pin():
+    """The whole Jacobian of a pin that slips, against differences of the residual."""
+    _, system = pendulum(friction=nts.JointFriction(coefficient=0.4, radius=0.05))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    for _ in range(3):
+        stepper.advance(0.02)
+    problem, x = stepper.problem, stepper.problem.x.array_r.copy()
+    x += 1e-4 * np.random.default_rng(1).uniform(-1, 1, len(x))
+
+    def residual(values):
+        other = problem.x.duplicate()
+        other.array_w[:] = values
+        found = problem.residual(problem.evaluate(other))
+        other.destroy()
+        return found
+
+    with problem.x as at:
+        at[:] = x
+    stepper.solver.assemble(problem.evaluate(problem.x))
+    # Joints' rows are lent a compliance, which is in the matrix alone.
+    found = dense(stepper.solver.matrix.operator)[-1]
+    expected = differences(lambda y: np.array([residual(z)[-1] for z in y]), x[None], 1e-6)[0]
+    assert np.count_nonzero(np.abs(found) > 1e-9 * np.abs(found).max()) > 1
+    assert relative(found, expected) < 1e-8
+    stepper.close()
