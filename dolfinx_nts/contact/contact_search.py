@@ -223,7 +223,11 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia or k >= self._declared else None,
         )
-        beyond = self._edges[k].find(positions, found) if k in self._edges else ()
+        beyond: Any = ()
+        if k in self._edges:
+            let_go = self._old[k].force > 0.0
+            let_go[found.node] = False
+            beyond = self._edges[k].find(positions, found, pair.slave.share[let_go])
         found = found.select(~self._foreign[k][found.node])
         if len(beyond):
             found = found.select(~np.isin(pair.slave.share[found.node], beyond))

@@ -135,12 +135,15 @@ class EdgeCoupling:
         if again is None:
             self._carried, self._tried = history, _NONE[:, 0]
 
-    def find(self, places: Sequence[FloatArray], nodes: Candidates) -> IntArray:
+    def find(
+        self, places: Sequence[FloatArray], nodes: Candidates, let_go: IntArray
+    ) -> IntArray:
         """Choose the pairs that may meet in a step. Collective.
 
         Args:
             places: Positions of all points of the pair's surfaces [m].
             nodes: This rank's slaves that may touch facets of the master.
+            let_go: Points of the slave that pressed in the last step and are none of these.
 
         Returns:
             Points of the slave beyond the master's edges that these pairs hold in their place.
@@ -160,10 +163,12 @@ class EdgeCoupling:
         ways = [edges.surface.gather(step.ahead[b]) for edges, b in both]
         found = self._pairs.closest(self._x, ways, reach + near, near, limit)
         old = gather_rows(self._comm, self._history.pair)
-        some = len(old) or len(self._tried) or found.some[0] or step.state.time == self._start
+        let_go = gather_rows(self._comm, let_go)
+        some = len(old) or len(let_go) or len(self._tried) or found.some[0]
+        some = some or step.state.time == self._start
         if not some and self.contact.pair.holds_nodes:
             return _NONE[:, 0]
-        pairs, chosen = self._pairs.numbers, self._choose(found, old, reach, limit)
+        pairs, chosen = self._pairs.numbers, self._choose(found, old, let_go, reach, limit)
         out = np.flatnonzero(chosen & (found.beyond > 0))
         mine = np.flatnonzero(chosen & self.contact.mine[pairs[:, 0]])
         self._chosen, self._gap = pairs[mine], found.gap[mine, 0]
@@ -171,20 +176,25 @@ class EdgeCoupling:
         beyond: IntArray = self.contact.ends[0][pairs[out, 0], found.beyond[out] - 1]
         return beyond
 
-    def _choose(self, found: Near, old: IntArray, reach: float, limit: float) -> BoolArray:
+    def _choose(
+        self, found: Near, old: IntArray, let_go: IntArray, reach: float, limit: float
+    ) -> BoolArray:
         """Which of the pairs that are near may press, shape (n,). Collective.
 
         Args:
             found: Where they meet.
             old: Pairs that pressed in the last step, or were followed, on all ranks, (k, 2).
+            let_go: As of `find`, of all ranks.
             reach: Bound on the step's motion [m].
             limit: As of `Pairs.closest` [m].
         """
         assert self._pairs is not None
         pairs, gap, holds = self._pairs.numbers, found.gap[:, 0], self.contact.pair.holds_nodes
         carries = np.isin(self._key(pairs), self._key(old)) & (holds | (gap < reach))
-        # Contact may pass along an edge.
+        # Contact may pass along an edge, or from a node on to an edge there.
         follows = np.isin(pairs[:, 0], old[:, 0]) | np.isin(pairs[:, 1], old[:, 1])
+        if len(let_go):
+            follows |= np.isin(self.contact.ends[0][pairs[:, 0]], let_go).any(axis=1)
         near, meet = gap > -_OVERSHOT * reach, found.meet[:, :2].any(axis=1)
         follows &= near & (gap < (limit if holds else reach))
         chosen = found.touch | ((carries | follows) & meet)

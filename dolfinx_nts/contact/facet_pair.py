@@ -16,6 +16,7 @@ from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facing import Facing
 from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.node_attachment import NodeAttachment
+from dolfinx_nts.contact.normal_cones import NormalCones
 from dolfinx_nts.contact.pair import (
     MARGIN,
     NO_CANDIDATES,
@@ -61,6 +62,7 @@ class FacetPair(ContactPair, master=Surface):
         self._free_edges = master.boundary_edges
         self.convex = ConvexEdges(master.facets, master.reference[master.facets])
         self.facing = Facing(self.slave, master, self.convex)
+        self.cones = NormalCones(self)
         self.slave_paths = SlavePaths(self)
 
     def _check_surfaces(self) -> None:

@@ -47,6 +47,14 @@ class NormalCones:
         order, first, count = at_points(ends[:, 0], self._slave.share)
         return _Neighbours(ends[order, 1], first, count)
 
+    def beside(self, node: IntArray) -> tuple[IntArray, IntArray]:
+        """Points that edges of the slave join with nodes (n,): each with the place of its node."""
+        other, first, every = self._neighbours
+        number = every[node]
+        pair = np.repeat(np.arange(len(node)), number)
+        start = np.cumsum(number) - number
+        return pair, other[first[node][pair] + np.arange(len(pair)) - start[pair]]
+
     def crossing(self, node: IntArray, normal: FloatArray, x: FloatArray) -> FloatArray:
         """Sine of the angle by which the surface at nodes crosses planes there, shape (n,).
 
@@ -57,11 +65,7 @@ class NormalCones:
             normal: Unit normals of the planes, shape (n, 3).
             x: Points of the slave [m].
         """
-        other, first, every = self._neighbours
-        number = every[node]
-        pair = np.repeat(np.arange(len(node)), number)
-        start = np.cumsum(number) - number
-        ends = other[first[node][pair] + np.arange(len(pair)) - start[pair]]
+        pair, ends = self.beside(node)
         way = x[ends] - x[self._slave.share[node]][pair]
         rise = np.einsum("ni,ni->n", way, normal[pair])
         far, found = np.linalg.norm(way, axis=1), np.zeros(len(node))

@@ -1,22 +1,18 @@
-"""Sharp rims of a master, beyond which edges hold what is tilted, and no facet's plane does."""
+"""Sharp rims of a master, beyond which edges hold what rises from it, and no facet's plane does."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.edges import Edges
-from dolfinx_nts.contact.facing import at_points
+from dolfinx_nts.contact.normal_cones import LETS_IN
 from dolfinx_nts.contact.pair import Candidates
-from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.kernels import compiled, facets, library
+from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
-
-#: Sine of the angle between the slave and the master from which on nodes of the slave beyond a
-#: sharp rim are not held, of rigid bodies and of others, which bend where they lie on each other.
-TILTED = 1e-3, 0.1
 
 
 class Rims:
@@ -36,55 +32,75 @@ class Rims:
         there = [tuple(ends) in sharp for ends in sides.reshape(-1, 2).tolist()]
         self._at: BoolArray = np.array(there, dtype=bool).reshape(at.shape) & free
         self._any: BoolArray = self._at.any(axis=1)
-        self._around = self._slave.facets, *facets_around(self._slave)
-        self._addresses = [a.ctypes.data for a in self._around]
-        self._least = TILTED[pair.yields]
+        self._cones = pair.cones
 
-    def without_tilted(
+    def without_rising(
         self,
         found: Candidates,
         x: tuple[FloatArray, FloatArray],
-        ways: tuple[FloatArray, FloatArray],
+        ways: Sequence[FloatArray],
     ) -> Candidates:
-        """Candidates but for those beyond such a rim where the slave is tilted.
+        """Candidates but for those beyond such a rim where the slave does not lie inside it.
 
         What slides over a rim turns about it, and edges hold it there: the plane of the facet
-        beyond it would throw the slave's nodes off.
+        beyond it would throw the slave's nodes off. Where the slave lies on the master up to the
+        rim, at the end of the step as is expected, its nodes beyond hold the rim outside.
 
         Args:
             found: Candidates.
             x: Points of the slave and of the master at t_n [m].
-            ways: Expected motion of this rank's slaves and of the master's points [m].
+            ways: Their expected motion [m].
         """
+        if not self._any.any():
+            return found
+        gaps = np.full(len(self._slave.share), np.inf)
+        gaps[found.node] = found.gap
+        gaps, moved = self._slave.at_all(gaps), x[0] + ways[0]
         some = np.flatnonzero(self._any[found.facet])
-        if not some.size:
+        facet, corners = found.facet[some], x[1] + ways[1]
+        node = self._slave.share[found.node[some]]
+        over = self._at[facet] & self._beyond(moved[node], corners, facet, found.xi[some])
+        out = np.flatnonzero(over.any(axis=1))
+        if not out.size:
             return found
-        some = some[self._tilts(found.node[some], found.normal[some], x[0])]
-        if not some.size:
-            return found
-        node, at = found.node[some], self._master.facets[found.facet[some]]
-        end = x[0][self._slave.share[node]] + ways[0][node]
-        xi, _ = compiled.project(end, (x[1] + ways[1])[at], found.xi[some])
-        beyond = facets.edge_excess(xi, at.shape[1]) > search.PREFERENCE
-        out = some[(self._at[found.facet[some]] & beyond).any(axis=1)]
-        return found.select(~np.isin(np.arange(len(found.node)), out))
+        c, over = found.select(some[out]), over[out]
+        pair, ends = self._cones.beside(c.node)
+        inside = over[pair] & ~self._beyond(moved[ends], corners, c.facet[pair], c.xi[pair])
+        rises = self._rises(c, pair, ends, gaps, x[0])
+        at, edge = np.nonzero(inside)
+        lies, up = ~over, rises[at]
+        lies[pair[at], edge] = True
+        lies[pair[at[up]], edge[up]] = False
+        stay = np.ones(len(found.node), dtype=bool)
+        stay[some[out]] = lies.all(axis=1)
+        return found if stay.all() else found.select(stay)
 
-    def _tilts(self, node: IntArray, normal: FloatArray, x: FloatArray) -> BoolArray:
-        """At which of this rank's slaves (n,) the slave is tilted against unit normals (n, 3).
+    def _beyond(
+        self, x: FloatArray, master: FloatArray, facet: IntArray, xi: FloatArray
+    ) -> BoolArray:
+        """Which edges of facets (n,) of the master's points points (n, 3) are beyond, (n, nc)."""
+        at = self._master.facets[facet]
+        xi, _ = compiled.project(x, master[at], xi)
+        beyond: BoolArray = facets.edge_excess(xi, at.shape[1]) > search.PREFERENCE
+        return beyond
+
+    def _rises(
+        self, c: Candidates, pair: IntArray, other: IntArray, gaps: FloatArray, x: FloatArray
+    ) -> BoolArray:
+        """Which neighbours of candidates are farther above the master than these, shape (m,).
+
+        Bodies that lie on each other bend together: what their nodes are away from each other
+        counts, not how their facets are turned.
 
         Args:
-            node: Their numbers.
-            normal: Of the master.
-            x: All points of the slave [m].
+            c: Candidates.
+            pair: Their places, shape (m,).
+            other: Points of the slave beside them, shape (m,).
+            gaps: Of all points of the slave, infinite for what is no candidate [m].
+            x: Points of the slave at t_n [m].
         """
-        nc, tilts = self._slave.facets.shape[1], np.empty(len(node), dtype=bool)
-        kernel, given = library.load().tilted, (len(node), node, normal, tilts)
-        library.run(kernel, nc, x, *self._addresses, self._least, *given)
-        return tilts
-
-
-def facets_around(surface: Surface) -> tuple[IntArray, IntArray, IntArray]:
-    """Facets of this rank's slaves in a row, where those of each begin, and how many they are."""
-    at = surface.facets
-    order, first, count = at_points(at.ravel(), surface.share)
-    return order // at.shape[1], first, count
+        way = x[other] - x[self._slave.share[c.node]][pair]
+        height = np.einsum("ni,ni->n", way, c.normal[pair])
+        rise = np.where(np.isfinite(gaps[other]), gaps[other] - c.gap[pair], height)
+        rises: BoolArray = rise > LETS_IN * np.linalg.norm(way, axis=1)
+        return rises

@@ -9,7 +9,7 @@ import numpy as np
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE
-from dolfinx_nts.contact.normal_cones import LETS_IN, NormalCones
+from dolfinx_nts.contact.normal_cones import LETS_IN
 from dolfinx_nts.contact.pair import MARGIN, Candidates, Motion
 from dolfinx_nts.kernels import compiled, facets, nts_element
 from dolfinx_nts.parallel import anywhere, raise_together
@@ -32,7 +32,7 @@ class SlavePaths:
     def __init__(self, pair: Any) -> None:
         self._pair, self._slave, self._master = pair, pair.slave, pair.master
         self._convex = pair.convex
-        self._cones = NormalCones(pair)
+        self._cones = pair.cones
         # Slaves that slide over edges in the step, and the facets before these.
         self._sliding: IntArray = np.empty((0, 2), dtype=np.int64)
 
@@ -55,8 +55,9 @@ class SlavePaths:
             master: Points of the master at t_n [m].
             motion: Expected in the step.
         """
-        x = slave[self._slave.share]
-        slave_path, master_path = self.gather(motion.paths)
+        x, both = slave[self._slave.share], zip(self._pair.surfaces, motion.paths, strict=True)
+        ways = [surface.gather(path) for surface, path in both]
+        slave_path, master_path = ways[0][self._slave.share], ways[1]
         found = self._round_edges(found, x, master, slave_path, master_path)
         found = self._past_edges(found, slave, master, slave_path, master_path, motion.reach)
         change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
@@ -66,8 +67,7 @@ class SlavePaths:
             other, _ = self._pair.measure(x, master, node, facet, start, motion.reach)
             found = _replace(found, other)
         if self._pair.has_edges:
-            ways = slave_path, master_path
-            found = self._pair.rims.without_tilted(found, (slave, master), ways)
+            found = self._pair.rims.without_rising(found, (slave, master), ways)
         aimed = motion.aimed
         if self._pair.is_long(motion.reach):
             stops = self._pair.stops(np.arange(len(x)), master)

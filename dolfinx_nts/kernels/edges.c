@@ -1,4 +1,4 @@
-/* Where sharp edges of two boundaries come closest (theory section 18), and where a slave is tilted beside them. */
+/* Where sharp edges of two boundaries come closest (theory section 18). */
 #include <math.h>
 
 /* Edges: positions of the boundary's points and their ways in the step, the two ends of each edge, the corners of the two facets that meet there,
@@ -171,27 +171,5 @@ void closest_edges(const Edges *slave, const Edges *master, const EdgeLimits *li
         touch[1] = ((meet[1] && fabs(gaps[0]) <= near) || (meet[2] && gaps[0] > near)) && gaps[1] < -near;
         numbers[0] += touch[0];
         numbers[1] += touch[1];
-    }
-}
-
-/* At which nodes of a slave the area of its facets around the node is tilted against a unit normal by a sine of more than
- * `least`. `around` has the facets of all nodes in a row, those of node i from first[i] on. */
-void tilted(int nc, const double *x, const long *facets, const long *around, const long *first, const long *count,
-            double least, long n, const long *nodes, const double *normals, unsigned char *tilts)
-{
-    for (long p = 0; p < n; p++, normals += 3) {
-        double area[3] = {0.0, 0.0, 0.0};
-        const long *own = around + first[nodes[p]];
-        for (long f = 0; f < count[nodes[p]]; f++) {
-            const long *at = facets + nc * own[f];
-            const double *corner = x + 3 * at[0];
-            for (int c = 2; c < nc; c++) {
-                const double *one = x + 3 * at[c - 1], *two = x + 3 * at[c];
-                for (int i = 0, j = 1, k = 2; i < 3; i++, j = (j + 1) % 3, k = (k + 1) % 3)
-                    area[i] += (one[j] - corner[j]) * (two[k] - corner[k]) - (one[k] - corner[k]) * (two[j] - corner[j]);
-            }
-        }
-        double along = dot(area, normals), square = dot(area, area);
-        tilts[p] = square - along * along > least * least * square;
     }
 }

@@ -120,7 +120,6 @@ _KERNELS = {
         *(_EDGES, _EDGES, ctypes.POINTER(EdgeLimits)),
         *(_REAL, _REAL, _REAL, _LONG, *(_ARRAY,) * 7),
     ),
-    "tilted": (_INT, *(_ARRAY,) * 5, _REAL, _LONG, *(_ARRAY,) * 3),
     "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
     "segments": (
         *(ctypes.POINTER(Cuts), _INT, _INT, _LONG, *(_ARRAY,) * 4),
