@@ -278,8 +278,7 @@ class Body:
     def reaction_labels(self) -> list[tuple[str, str]]:
         """Name and unit of each row of `reactions`."""
         zero = np.zeros(self.num_owned)
-        count = len(self.reactions(zero, zero))
-        return [(str(k), "N") for k in range(count)]
+        return [(str(k), "N") for k in range(len(self.reactions(zero, zero)))]
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
         """Smallest det F on this rank, inf without cells in 3D, and X of its cell [m], shape (3,).
@@ -300,10 +299,7 @@ class Body:
         )
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
-        """Largest turn of its directors between two displacements on this rank [rad].
-
-        A run warns of one that is far in a step.
-        """
+        """Largest turn of its directors between two displacements on this rank [rad], if any."""
         return 0.0
 
     def prescribed_turn(self, start: float, end: float) -> float:

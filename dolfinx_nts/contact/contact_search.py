@@ -59,8 +59,7 @@ class ContactSearch:
         self._pairs, self._of, self._comm = contacts, list(bodies), comm
         self.numbers: list[int] = []
         self.bodies: list[tuple[int, ...]] = []
-        self.elements: list[ContactElements] = []
-        self.idle: list[ContactElements] = []
+        self.elements, self.idle = list[ContactElements](), list[ContactElements]()
         self.idle_gaps: list[FloatArray] = []
         self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
         number = {id(pair): k for k, pair in enumerate(contacts)}
@@ -176,8 +175,7 @@ class ContactSearch:
 
     def touched(self) -> set[int]:
         """Bodies of contacts that have unknowns, the same on all ranks. Collective."""
-        local = np.array([float(awake.any()) for awake in self._with_unknowns])
-        on = global_max(self._comm, local) > 0.0
+        on = global_max(self._comm, np.array([float(a.any()) for a in self._with_unknowns])) > 0.0
         return set().union(*itertools.compress(self.bodies, on))
 
     def _positions(self, k: int) -> Sequence[FloatArray]:
@@ -223,14 +221,11 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia or k >= self._declared else None,
         )
-        beyond: Any = ()
+        mine, share = ~self._foreign[k][found.node], pair.slave.share
         if k in self._edges:
-            let_go = self._old[k].force > 0.0
-            let_go[found.node] = False
-            beyond = self._edges[k].find(positions, found, pair.slave.share[let_go])
-        found = found.select(~self._foreign[k][found.node])
-        if len(beyond):
-            found = found.select(~np.isin(pair.slave.share[found.node], beyond))
+            beyond = self._edges[k].find(positions, found, share[self._old[k].force > 0.0])
+            mine &= ~np.isin(share[found.node], beyond)
+        found = found.select(mine)
         if not anywhere(self._comm, len(found.node) > 0):
             return None
         overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
@@ -258,8 +253,7 @@ class ContactSearch:
             before = step.factor * elements.carried(self._old[k])
             before[~massless] = np.nan
             law = replace(law, before=before)
-        offset = pair.offset[found.node] if pair.adjust else 0.0
-        return replace(elements, law=law, offset=offset)
+        return replace(elements, law=law, offset=pair.offset[found.node] if pair.adjust else 0.0)
 
     def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
         """Return which need unknowns: all within reach, and those that had them in the last step.
@@ -285,8 +279,7 @@ class ContactSearch:
         """Give unknowns to idle candidates whose gaps a solution closes, if any. Collective."""
         if not self._watching:
             return False
-        u1 = [terms.u1 for terms in e.bodies]
-        self.idle_gaps = self._gaps(self.idle, u1)
+        self.idle_gaps = self._gaps(self.idle, [terms.u1 for terms in e.bodies])
         closed = [
             ~(gap >= -c.law.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
         ]
@@ -402,15 +395,13 @@ class ContactSearch:
             # Where nothing carries yet, bodies may touch at a point and have all means open.
             sag = 0.0 if anywhere(self._comm, bool(carries.any())) else c.sag
             touching = carries | (c.candidates.gap <= np.maximum(near, sag))
-            gap = c.gap(x)
-            multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
+            multipliers[:, 0] -= np.where(touching, near + np.maximum(c.gap(x), 0.0), 0.0)
         return multipliers
 
     def carried(self, k: int) -> FloatArray:
         """Multipliers of the contact forces of the last step as they were, (n, constraints)."""
         c, old = self.elements[k], self._carried[self.numbers[k]]
-        node = c.candidates.node
-        forces = c.multipliers(old.force[node], old.tangential[node])
+        forces = c.multipliers(*(of[c.candidates.node] for of in (old.force, old.tangential)))
         return self._step.factor * forces / c.law.scale[:, None]
 
     @property

@@ -136,14 +136,14 @@ class EdgeCoupling:
             self._carried, self._tried = history, _NONE[:, 0]
 
     def find(
-        self, places: Sequence[FloatArray], nodes: Candidates, let_go: IntArray
+        self, places: Sequence[FloatArray], nodes: Candidates, pressed: IntArray
     ) -> IntArray:
         """Choose the pairs that may meet in a step. Collective.
 
         Args:
             places: Positions of all points of the pair's surfaces [m].
             nodes: This rank's slaves that may touch facets of the master.
-            let_go: Points of the slave that pressed in the last step and are none of these.
+            pressed: This rank's points of the slave that pressed in the last step.
 
         Returns:
             Points of the slave beyond the master's edges that these pairs hold in their place.
@@ -163,7 +163,8 @@ class EdgeCoupling:
         ways = [edges.surface.gather(step.ahead[b]) for edges, b in both]
         found = self._pairs.closest(self._x, ways, reach + near, near, limit)
         old = gather_rows(self._comm, self._history.pair)
-        let_go = gather_rows(self._comm, let_go)
+        held = self.contact.pair.slave.share[nodes.node]
+        let_go = gather_rows(self._comm, np.setdiff1d(pressed, held))
         some = len(old) or len(let_go) or len(self._tried) or found.some[0]
         some = some or step.state.time == self._start
         if not some and self.contact.pair.holds_nodes:
