@@ -212,14 +212,14 @@ class ContactSearch:
 
     def _find(self, k: int, reach: float) -> ContactElements | None:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self._of[k], self._step
-        positions = self._positions(k)
+        positions, rests = self._positions(k), not step.integrator.inertia
         found, self._followed[k], self._cover[k] = pair.find(
             positions,
             self._old[k].facet,
             path,
-            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], self._repeats > 0),
-            # In statics steps may be of any length, and what they carry inside is looked for.
-            self._old[k].followed if step.integrator.inertia or k >= self._declared else None,
+            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], bool(self._repeats), rests),
+            # What load steps carry inside is looked for.
+            None if rests and k < self._declared else self._old[k].followed,
         )
         mine, share = ~self._foreign[k][found.node], pair.slave.share
         if k in self._edges:

@@ -73,12 +73,14 @@ class Motion(NamedTuple):
         aimed: Facet that a path of an earlier attempt at the step met, or -1, of each of the rank's
             slave nodes.
         solved: Whether the paths are those of a solution, whose end is to be in equilibrium.
+        at_rest: Whether it is a load step, which may be of any length and lead elsewhere.
     """
 
     reach: float
     paths: Sequence[FloatArray]
     aimed: IntArray
     solved: bool = False
+    at_rest: bool = False
 
 
 class Found(NamedTuple):

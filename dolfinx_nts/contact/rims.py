@@ -44,12 +44,13 @@ class Rims:
 
         What slides over a rim turns about it, and edges hold it there: the plane of the facet
         beyond it would throw the slave's nodes off. Where the slave lies on the master up to the
-        rim, at the end of the step as is expected, its nodes beyond hold the rim outside.
+        rim, at the end of the step as is expected, or as a load step begins, its nodes beyond hold
+        the rim outside.
 
         Args:
             found: Candidates.
             x: Points of the slave and of the master at t_n [m].
-            ways: Their expected motion [m].
+            ways: Their expected motion [m]; none in load steps.
         """
         if not self._any.any():
             return found

@@ -67,7 +67,8 @@ class SlavePaths:
             other, _ = self._pair.measure(x, master, node, facet, start, motion.reach)
             found = _replace(found, other)
         if self._pair.has_edges:
-            found = self._pair.rims.without_rising(found, (slave, master), ways)
+            along = [0.0 * way if motion.at_rest else way for way in ways]
+            found = self._pair.rims.without_rising(found, (slave, master), along)
         aimed = motion.aimed
         if self._pair.is_long(motion.reach):
             stops = self._pair.stops(np.arange(len(x)), master)
