@@ -79,6 +79,8 @@ def _two_steps() -> Iterator[str]:
     yield f"forms compiled or found in {compat.cache_folder()}: {time.perf_counter() - start:.1f} s"
     start = time.perf_counter()
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=2e-3, progress=False)
+    if run.status != "completed":
+        raise RuntimeError(f"two steps of two cubes in contact: {run.status}")
     yield f"two steps of two cubes in contact: {time.perf_counter() - start:.2f} s, {run.status}"
 
 

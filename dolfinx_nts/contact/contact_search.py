@@ -98,8 +98,8 @@ class ContactSearch:
     ) -> None:  # fmt: skip
         """Make the elements of a step, and begin it for edges, as of `Coupling`. Collective."""
         # Their forces are the first guess: of t_n, or of the solution that is gone on from.
-        touching = slice(len(self.elements))
-        self._carried = history if again is None else self.history(again.parts[touching])
+        n = len(self.elements)
+        self._carried = history if again is None else self.history(again.parts[:n])
         self._step, self._old, self._placed = step, history, {}
         if step.dt or self._begun is None:
             self._begun = step.state
@@ -212,12 +212,13 @@ class ContactSearch:
 
     def _find(self, k: int, reach: float) -> ContactElements | None:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self._of[k], self._step
-        positions, rests = self._positions(k), not step.integrator.inertia
+        positions, ahead = self._positions(k), [step.ahead[b] for b in bodies]
+        rests = not step.integrator.inertia
         found, self._followed[k], self._cover[k] = pair.find(
             positions,
             self._old[k].facet,
             path,
-            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], bool(self._repeats), rests),
+            Motion(reach, ahead, self._aimed[k], self._repeats > 0, rests),
             # What load steps carry inside is looked for.
             None if rests and k < self._declared else self._old[k].followed,
         )
@@ -228,8 +229,8 @@ class ContactSearch:
         found = found.select(mine)
         if not anywhere(self._comm, len(found.node) > 0):
             return None
-        overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
-        start, end = step.state.time, step.state.time + step.dt
+        overlap, start = self._old[k].overlap[found.node], step.state.time
+        ramp = step.integrator.ramp
         found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
         elements: ContactElements = pair.elements(found, positions, path, step)
         gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
@@ -239,7 +240,7 @@ class ContactSearch:
         # The sign of a force that is rounding must not decide on stick or slip.
         force = step.force_rounding(bodies) if pair.friction else 0.0
         law = replace(
-            elements.law, overlap=(1.0 - ramp(end)) * overlap, rounding=_TOUCH * gap,
+            elements.law, overlap=(1.0 - ramp(start + step.dt)) * overlap, rounding=_TOUCH * gap,
             force_rounding=_TOUCH * force,
         )  # fmt: skip
         if pair.friction and not step.dt:
@@ -269,8 +270,8 @@ class ContactSearch:
         if c.law.strong:
             closes = self._gap(k, c, self._step.first) < -_SURELY * reach
             return closes | (force > no_pull(self._old[k].tangential[node]))
-        # What goes to and fro at the limit would change the layout in every step.
-        # All nodes that rest, or none: rounding of their gaps must not decide which carry forces.
+        # What goes to and fro at the limit would change the layout in every step, and rounding of
+        # gaps must not decide which of the nodes that rest carry forces.
         near = reach + c.law.rounding if c.pair.redundant else reach
         return had[node] | (c.candidates.gap < near) | (force > 0.0)
 
@@ -328,8 +329,7 @@ class ContactSearch:
         """
         far = [0.0]
         for of, c, part in zip(self.bodies, self.elements, e.parts, strict=False):
-            on = part.active
-            end = c.pair.positions([e.bodies[b].u1 for b in of])
+            on, end = part.active, c.pair.positions([e.bodies[b].u1 for b in of])
             due = np.broadcast_to(c.offset - c.law.overlap, on.shape)[on]
             far.append(c.pair.strayed(end, c.candidates.select(on), due))
         return float(global_max(self._comm, np.array(far)).max())

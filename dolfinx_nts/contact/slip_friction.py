@@ -19,7 +19,7 @@ FrictionFunction = Callable[[FloatArray, FloatArray], Any]
 _APART = float(np.finfo(float).eps) ** (1 / 3)
 #: What is added to a speed or a pressure of 0.
 _TINY = float(np.sqrt(np.finfo(float).tiny))
-_WANTED = "of arrays of speed [m/s] and pressure [Pa]; return positive numbers"
+_WANTED = "; it must return positive coefficients for arrays of speed [m/s] and pressure [Pa]"
 
 
 def at_rest(function: Any) -> float:
@@ -28,14 +28,14 @@ def at_rest(function: Any) -> float:
     Raises:
         ValueError: It raises, or returns no positive number.
     """
-    none = np.zeros(1)
+    none = np.zeros(2)
     try:
         found = np.asarray(function(none, none), dtype=float).reshape(-1)
-        (value,) = np.broadcast_to(found, 1).tolist()
+        value, _ = np.broadcast_to(found, 2).tolist()
     except Exception as error:
-        raise ValueError(f"friction={function!r}: raised {error!r} {_WANTED}") from error
+        raise ValueError(f"friction={function!r}: raised {error!r}{_WANTED}") from error
     if not (is_finite(value) and value > 0.0):
-        raise ValueError(f"friction={function!r}: is {value!r} without slip {_WANTED}")
+        raise ValueError(f"friction={function!r}: is {value!r} without slip{_WANTED}")
     return float(value)
 
 
@@ -76,7 +76,7 @@ class SlipFriction(Batch):
         if not (np.isfinite(found) & (found > 0.0)).all():
             k = int(np.argmin(np.isfinite(found) & (found > 0.0)))
             raise ValueError(
-                f"friction is {found[k]!r} at {v[k]!r} m/s and {p[k]!r} Pa {_WANTED}"
+                f"friction is {found[k]:.6g} at {v[k]:.6g} m/s and {p[k]:.6g} Pa{_WANTED}"
             )
         mu, by_ahead, by_behind, by_more, by_less = np.split(found, 5)
         return (

@@ -56,12 +56,12 @@ class JointFriction:
     radius: float | None = None
 
     def __post_init__(self) -> None:
-        for name, unit in (("bound", "N m or N"), ("coefficient", ""), ("radius", "m")):
+        for name, unit in (("bound", "N m or N"), ("coefficient", "-"), ("radius", "m")):
             if getattr(self, name) is not None:
                 require_positive(name, getattr(self, name), unit)
         if (self.bound is None) == (self.coefficient is None):
             raise ValueError(
-                f"bound={self.bound!r}, coefficient={self.coefficient!r}: pass one of both"
+                f"bound={self.bound!r}, coefficient={self.coefficient!r}: pass exactly one"
             )
         if self.bound is not None and self.radius is not None:
             raise ValueError(f"radius={self.radius!r}: goes with coefficient=, not with bound=")

@@ -245,12 +245,11 @@ class LoadStepper(Stepper):
         state = replace(kept, v=self.solution.rates)
         try:
             for _ in range(_RELAXATIONS):
-                share, alone = problem.stabilization.share, False
-                if share and not tried:
-                    tried, problem.stabilization.share = True, 0.0
-                    alone = not self._unheld(state, dt)
-                    problem.stabilization.share = 0.0 if alone else share
                 try:
+                    if self._stabilization and not tried:
+                        tried, problem.stabilization.share = True, 0.0
+                        if self._unheld(state, dt):
+                            problem.stabilization.share = self._stabilization
                     step = self._solve(state, dt, search)
                     reached = state_after(problem, step, time)
                     # What each slipped is that of the whole load step.
@@ -263,13 +262,13 @@ class LoadStepper(Stepper):
                     reached = replace(reached, contacts=contacts)
                     self._check_missed(reached)
                     moved = float(problem.lengths.motion_of(step).max()) / size
-                    if alone and moved > _FAR:
+                    if moved > _FAR and self._stabilization and not problem.stabilization.share:
                         raise StepFailedError("without stabilization bodies move far")
                 except UserFunctionError:
                     raise
                 except StepFailedError as failure:
-                    if alone:
-                        problem.stabilization.share = share
+                    if self._stabilization and not problem.stabilization.share:
+                        problem.stabilization.share = self._stabilization
                         continue
                     # Bodies in search of each other move by load over stabilization, whatever dt.
                     if not 0.0 < problem.stabilization.share < _STIFFEST:

@@ -723,7 +723,7 @@ def above(master, *, cells=(2, 2), height=0.5, cell_type=CellType.hexahedron, tu
         cell_type=cell_type, ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
     rubber = nts.NeoHookean(young=1e6, poisson=0.3)
-    body = nts.Continuum(mesh, rubber, density=1e3, name="plate", **options)
+    body = nts.Continuum(mesh, rubber, density=1e3, degree=1, name="plate", **options)
     pair = nts.ContactPair(slave=body.surface(lambda x: x[2] < 1e-9), master=master)
     return nts.System([body], contacts=[pair])
 

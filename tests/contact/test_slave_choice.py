@@ -19,7 +19,7 @@ COMM = MPI.COMM_WORLD
 def cube(cells, low, name, cell_type=CellType.hexahedron, material=RUBBER, **options):
     """A unit cube above z = low; its lower or upper face is the contact surface."""
     mesh = box([0, 0, low], [1, 1, low + 1], cells, cell_type)
-    return nts.Continuum(mesh, material, density=1e3, name=name, **options)
+    return nts.Continuum(mesh, material, density=1e3, degree=1, name=name, **options)
 
 
 def face(body, z):

@@ -77,13 +77,14 @@ def test_wrong_functions_are_told():
     body = nts.RigidBody(box([0, 0, 0], [1, 1, 1], 1), density=1.0, name="cube")
     floor = nts.Plane((0, 0, 0), (0, 0, 1))
     for wrong, text in (
-        (lambda v: 0.1, "raised TypeError.*return positive numbers"),
-        (lambda v, p: -0.1, "is -0.1 without slip of arrays of speed"),
+        (lambda v: 0.1, "raised TypeError.*return positive coefficients"),
+        (lambda v, p: 0.3 if v < 1 else 0.2, "raised ValueError.*for arrays of speed"),
+        (lambda v, p: -0.1, "is -0.1 without slip; it must return"),
         (lambda v, p: 0.0 * v, "is 0.0 without slip"),
     ):
         with pytest.raises(ValueError, match=text):
             nts.ContactPair(body.surface(everywhere), floor, friction=wrong)
     pair = nts.ContactPair(body.surface(everywhere), floor, friction=lambda v, p: 0.1 - v)
     system = nts.System([body], contacts=[pair], gravity=(1, 0, -1))
-    with pytest.raises(nts.UserFunctionError, match="friction is .* m/s and .* Pa of arrays"):
+    with pytest.raises(nts.UserFunctionError, match="friction is .* m/s and .* Pa; it must"):
         nts.Stepper(system, nts.EnergyMomentum()).advance(1.0)

@@ -36,7 +36,7 @@ def patch(cells, cell="hexahedron", metre=1.0, friction=0.0):
         )
         floor = [] if low else [nts.Dirichlet(at(2, 0.0, metre), components=(2,))]
         bodies.append(nts.Continuum(
-            mesh, linear, density=1.0, bcs=symmetry(metre) + floor, name=f"at {low}",
+            mesh, linear, density=1.0, degree=1, bcs=symmetry(metre) + floor, name=f"at {low}",
             traction=[load] if low else [],
         ))  # fmt: skip
     slave, master = (b.surface(at(2, 0.5 * metre, metre)) for b in bodies)

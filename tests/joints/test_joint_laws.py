@@ -340,8 +340,8 @@ def test_wrong_laws(laws, error, text):
         disc(0.0, **laws)
     for given, text in (
         ({"bound": 0.0}, "bound=0.0: must be"),
-        ({}, "bound=None, coefficient=None: pass one of both"),
-        ({"bound": 1.0, "coefficient": 0.1}, "pass one of both"),
+        ({}, "bound=None, coefficient=None: pass exactly one"),
+        ({"bound": 1.0, "coefficient": 0.1}, "pass exactly one"),
         ({"bound": 1.0, "radius": 0.1}, "radius=0.1: goes with coefficient="),
     ):
         with pytest.raises(ValueError, match=text):

@@ -32,7 +32,8 @@ class Ogden(Elastic):
         mu: Moduli [Pa], a tuple of numbers, or of Constants or Functions on the body's mesh. The
             shear modulus at small strain, sum mu_p alpha_p/2, must be > 0; other authors write
             2 mu_p/alpha_p for this mu_p, so that theirs is the sum of mu_p.
-        alpha: Exponents [-], as many numbers between -20 and 20, not zero.
+        alpha: Exponents [-], as many numbers from 0.1 to 20 or from -20 to -0.1: with smaller ones
+            what is left of the sum is rounding.
         bulk: Bulk modulus at small strain [Pa], > 0; a number, Constant or Function.
 
     Raises:
@@ -61,9 +62,9 @@ class Ogden(Elastic):
             raise ValueError(f"mu={mu!r}, alpha={alpha!r}: pass as many of each, at least one")
         for k, (modulus, exponent) in enumerate(zip(mu, alpha, strict=True)):
             require_finite_parameter(f"mu[{k}]", modulus, "Pa")
-            if not (is_finite(exponent) and 0 < abs(exponent) <= 20):
+            if not (is_finite(exponent) and 0.1 <= abs(exponent) <= 20):
                 raise ValueError(
-                    f"alpha[{k}]={exponent!r}: pass a number between -20 and 20, not zero [-]"
+                    f"alpha[{k}]={exponent!r}: pass one from 0.1 to 20, or from -20 to -0.1 [-]"
                 )
         require_positive_parameter("bulk", self.bulk, "Pa")
         if all(map(is_number, mu)) and not self.small_strain[1] > 0:
