@@ -55,7 +55,7 @@ def scene(
         comm: MPI communicator.
         cells: Cells along an edge of the first and the second cube.
         material: Strain energy of both.
-        cell_type: Hexahedra or tetrahedra.
+        cell_type: Hexahedra or tetrahedra, of degree 1.
         density: Reference density [kg/m^3] in the units of the scene.
         metre: Length of a metre in the units of the scene, e.g. 1e3 for a scene in mm.
         speed: Speed of the first cube, 2 m/s if not given; the spin scales with it.
@@ -77,10 +77,11 @@ def scene(
         return along * np.array([1.0 + arm[2], 0 * x[0], -arm[0]])
 
     left = nts.Continuum(
-        box([0, 0, 0], 1.0, 0.0, cells[0]), material, density=density, velocity=spin, name="left"
-    )
+        box([0, 0, 0], 1.0, 0.0, cells[0]), material, density=density, velocity=spin, degree=1,
+        name="left",
+    )  # fmt: skip
     right = nts.Continuum(
-        box([1.05, 0, 0], 1.2, -0.1, cells[1]), material, density=density, name="right"
+        box([1.05, 0, 0], 1.2, -0.1, cells[1]), material, density=density, degree=1, name="right"
     )
     tolerance = 1e-9 * metre
     pair = nts.ContactPair(
