@@ -83,7 +83,7 @@ def test_a_body_keeps_its_mass_centre_and_inertia(kind):
     bodies = []
     for mass in ("consistent", "redistributed"):
         body = nts.Continuum(
-            box(high=(1.0, 0.7, 0.5), cells=(6, 3, 6), cell=kind), RUBBER, density=1e3,
+            box(high=(1.0, 0.7, 0.5), cells=(6, 3, 6), cell=kind), RUBBER, density=1e3, degree=1,
             velocity=lambda x: np.array([2 + x[1], x[2] - x[0], 0.3 * x[0]]),
         )  # fmt: skip
         body.surface(lambda x: x[0] > 1 - 1e-9, mass=mass)

@@ -257,8 +257,9 @@ def test_terms_of_ogden_that_do_not_fit_are_refused():
         nts.Ogden(1.0, (2.0,), 1.0)
     with pytest.raises(ValueError, match="pass as many of each"):
         nts.Ogden((1.0, 2.0), (2.0,), 1.0)
-    with pytest.raises(ValueError, match=r"alpha\[1\]=0: pass a number between"):
-        nts.Ogden((1.0, 2.0), (2.0, 0), 1.0)
+    for exponent in (0, -0.09, 21.0):
+        with pytest.raises(ValueError, match=rf"alpha\[1\]={exponent}: pass one from 0.1 to 20"):
+            nts.Ogden((1.0, 2.0), (2.0, exponent), 1.0)
 
 
 # ---- discrete gradients
