@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -148,7 +148,9 @@ class Couplings:
             found[starts[i]] = Load(starts[k], np.flatnonzero(batch.joint == row), bearing)
         return found
 
-    def tell_loads(self, own: Sequence[dict[str, FloatArray]]) -> None:
+    def tell_loads(
+        self, own: Sequence[dict[str, FloatArray]], loads: Mapping[int, Load]
+    ) -> None:
         """Add to the unknowns of laws that depend on it what their joints carry.
 
         That is "load", the force of a joint's bearing times the factor of the step, (n, bearing),
@@ -156,8 +158,8 @@ class Couplings:
 
         Args:
             own: Of each of `elements` its own unknowns, see `Unknowns.own_values`.
+            loads: `loads` of these elements.
         """
-        loads = self.loads
         elements = self.elements if loads else []
         for i, (k, rows, bearing) in loads.items():
             scale = elements[k].scale[rows, None]

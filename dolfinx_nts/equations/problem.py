@@ -229,11 +229,11 @@ class StepProblem:
         combined = [a for c in elements if c.combination is not None for a in c.combination]
         places = [a for c in elements for a in c.points()]
         numbers = (np.array(self.awake), widths, *places, *combined)
+        self._bearing = self.couplings.loads
         if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
             of = self.couplings.bodies
-            loads = self.couplings.loads
-            self.unknowns = Unknowns(self.batches, self.awake, elements, of, loads)
+            self.unknowns = Unknowns(self.batches, self.awake, elements, of, self._bearing)
             self.version += 1
             self._numbers = numbers
         self._of_none = None
@@ -324,7 +324,7 @@ class StepProblem:
         laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
-        self.couplings.tell_loads(own)
+        self.couplings.tell_loads(own, self._bearing)
         parts = evaluate_together(self.system.comm, elements, positions, own)
         contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)
         self._shared.divide(

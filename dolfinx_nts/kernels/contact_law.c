@@ -7,8 +7,8 @@
 /* ---- the laws */
 
 /* What the pairs have in common, and what each has of its own in a step; `before` is NULL without
-   massless nodes, `unmoved` where nothing is prescribed, `coefficients` with their derivatives by the
-   distance of the slip and by the force that presses unless each pair has a coefficient of its own. */
+   massless nodes, `unmoved` where nothing is prescribed; `coefficients`, with their derivatives by the distance of
+   the slip and by the force that presses, are NULL where all pairs have the same constant coefficient. */
 typedef struct {
     const double *scale, *yielding, *none, *before;
     int size, row, friction, endless, strong, redundant;
@@ -152,7 +152,8 @@ static int rub(const Law *law, long i, const Together *together, const Slip *sli
     const double *by_gap = tangent + law->row * law->size;
     int size = law->size, last = size - 2, stick;
     int new = end[0] >= 0.0 && (law->strong || law->redundant);
-    double mu = law->coefficients ? law->coefficients[i] : law->coefficient, *value = residual + last, *rows = tangent + last * size;
+    double mu = law->coefficients ? law->coefficients[i] : law->coefficient;
+    double *value = residual + last, *rows = tangent + last * size;
     double bound = mu * (law->strong ? -end[0] : larger(-end[0], 0.0)), loose[4], less[2], trial[2];
     if (new)
         bound -= mu * yielding * residual[law->row];
