@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
-from dolfinx_nts.interaction.constraint_elements import TINY, largest_of_joints
+from dolfinx_nts.interaction.constraint_elements import SHIFT, TINY, largest_of_joints
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.kinematics import Kinematics
 from dolfinx_nts.interaction.measures import HoldingLaw, Measure, Move, holds
@@ -151,7 +151,9 @@ class MeasuredElements(PointElements):
             ends = gradient.end
             if theta is not None:
                 ends = measure.kind.gradient(end, end, at_end, at_end).end
-            of_row = unit, self.scale * row.value, unit * row.by_end, self.scale * row.by_force
+            # What sticks at a limit is held twice.
+            lent = np.where(row.by_force == 0.0, -SHIFT * row.by_end, row.by_force)
+            of_row = unit, self.scale * row.value, unit * row.by_end, self.scale * lent
             status, memory = row.status[None], np.column_stack([at_end, pull, self.since])
         library.run(
             library.load().forces_along, size // 3, a.shape[1], held, share, factor, n,
