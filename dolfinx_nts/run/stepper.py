@@ -53,6 +53,8 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
+#: Parts of a cut step that are solved until the next ones are twice as long.
+_WELL = 4
 #: First steps whose failure may come from how the run starts.
 _FIRST = 2
 #: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
@@ -223,7 +225,8 @@ class Stepper:
     def advance(self, dt: float, *, end: float | None = None) -> State:
         """Advance by dt; a step that is not solved is cut, up to `newton.max_retries` times.
 
-        Where n parts are left, they become 2 n + 1.
+        Where n parts are left, they become 2 n + 1, and half as many again after four that are
+        solved, or twice as many each time when that fails.
 
         Args:
             dt: Time to advance [s], > 0.
@@ -257,23 +260,28 @@ class Stepper:
         dt = float(dt)
         self.system.check_alive()
         self.start(dt)
-        end, parts, retries = self.state.time + dt if end is None else end, 1, 0
+        end, parts, depth = self.state.time + dt if end is None else end, 1, 0
+        well, enough, grown = 0, _WELL, False
         while parts:
             try:
                 self._step(dt, end - (parts - 1) * dt)
             except UserFunctionError:
                 raise
             except StepFailedError as failure:
-                if retries == self.newton.max_retries:
+                if depth == self.newton.max_retries:
                     raise
-                retries += 1
+                depth += 1
+                well, enough, grown = 0, enough * (1 + grown), False
                 self.solution.retries += 1
                 # An odd number: halves of halves would end where one of them has failed.
                 parts = 2 * parts + 1
                 dt = (end - self.state.time) / parts
                 logger.info("%s; retrying with dt=%.3g", failure, dt)
             else:
-                parts -= 1
+                parts, well = parts - 1, well + 1
+                if depth and parts > 1 and well >= enough:
+                    parts, depth, well, grown = (parts + 1) // 2, depth - 1, 0, True
+                    dt = (end - self.state.time) / parts
                 yield not parts
 
     def start(self, dt: float) -> None:

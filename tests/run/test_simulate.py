@@ -12,6 +12,7 @@ from integrators import MID_STEP
 from scenes import RUBBER, bottom, box, fail_once, top
 
 import dolfinx_nts as nts
+from dolfinx_nts.validation import StepFailedError
 
 COMM = MPI.COMM_WORLD
 
@@ -66,6 +67,27 @@ def test_writers_see_the_parts_of_a_cut_step():
     assert run.retries == 1 and seen.ends == [False] * 5 + [True]
     assert seen.times == list(run.balance["time"])
     assert np.array(seen.times) == pytest.approx(2e-3 * np.array([0, 1, 2, 7 / 3, 8 / 3, 3, 4]))
+
+
+def test_parts_of_a_cut_step_grow_again(monkeypatch):
+    """Steps beyond 0.01 fail for the first 5 % of one of length 1; after it none of them does."""
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), velocity=(1, 0, 0))
+    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum())
+    attempt, times = stepper.attempt, [0.0]
+
+    def hard(time):
+        if stepper.state.time < 0.05 and time - stepper.state.time > 0.01:
+            raise StepFailedError("hard")
+        return attempt(time)
+
+    monkeypatch.setattr(stepper, "attempt", hard)
+    for _ in stepper.in_parts(1.0):
+        times.append(stepper.state.time)
+    steps = np.diff(times)
+    # Without growth 1/127 each; with it four of each length until it fails, 8, 16, ... then.
+    assert times[-1] == 1.0 and steps[0] == pytest.approx(1 / 127)
+    assert len(steps) < 127 / 3 and steps.max() > 5 * steps[0]
+    assert body.position[0] == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.mpi
