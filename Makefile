@@ -8,8 +8,8 @@ export PYTEST_ARGS RUNS
 
 help:
 	@echo 'make setup          what the others do first: packages of Debian, .venv'
-	@echo 'make test           lint, the fast tests in serial, a case of each parallel one on 2 ranks'
-	@echo 'make test-all       what make test leaves out: the tests marked slow, likewise'
+	@echo 'make test           lint, of each fast test the case of the week in serial, parallel ones on 2 ranks'
+	@echo 'make test-all       what make test leaves out: slow tests and other cases, likewise'
 	@echo '                    (.venv/bin/python -m pytest runs both in serial; -m "not slow" the fast)'
 	@echo 'make demo           demos/$(DEMO).py on 2 ranks, output in out/$(DEMO) (DEMO=name for another)'
 	@echo 'make docs           the site, in docs/_build/html; a warning is an error (RUNS=no: no pictures)'

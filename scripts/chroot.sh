@@ -1,6 +1,6 @@
 #!/bin/bash
 # chroot.sh SUITE [COMMAND] | --remove: run the fast tests (or COMMAND) on a copy of this repository in a
-# minimal Debian SUITE (trixie); on 2 ranks one case of each, as they look at its libraries. The root is
+# minimal Debian SUITE (trixie). The root is
 # made once and kept in
 #   ${DOLFINX_NTS_ROOTS:-${XDG_CACHE_HOME:-$HOME/.cache}/dolfinx_nts}
 # and the mirror is the one this machine's apt uses (or DEBIAN_MIRROR). Every mount is made in a

@@ -1,6 +1,5 @@
 #!/bin/bash
-# The fast tests on DOLFINx of PyPI, in a virtual environment .venv-wheels with the extras of pyproject.toml;
-# on 2 ranks one case of each, as they look at its libraries.
+# The fast tests on DOLFINx of PyPI, in a virtual environment .venv-wheels with the extras of pyproject.toml.
 # Needs no root: a C compiler, and a Python of 3.12 to 3.14 with its headers. PYTHON_WHEELS chooses it;
 # without, it is one on PATH or of pyenv.
 set -euo pipefail

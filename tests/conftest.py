@@ -42,8 +42,8 @@ LONG = {
     "test_stability", "test_docs", "test_demo_output", "test_unwritten", "test_massless",
     "test_demo_blocks", "test_demo_stability", "test_conformance", "test_impacts", "test_tradeoff",
 }  # fmt: skip
-#: On several ranks, and with --one-case, one fast and one slow case of a test run, others in the
-#: next week. In serial all of them run: ranks and other libraries seldom fail a single case.
+#: One of a test's cases that may be fast is, and its others are slow; in the next week it is
+#: another one. On several ranks a fast and a slow one run: ranks seldom fail a single case.
 WEEK = datetime.date.today().isocalendar().week
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
@@ -81,17 +81,10 @@ def pytest_addoption(parser):
     group = parser.getgroup("noise", "rounding as on another machine, see tests/noise.py")
     group.addoption("--noise", choices=noise.KINDS, help="what is noisy")
     group.addoption("--noise-seed", type=int, default=0, help="another seed, another machine")
-    parser.addoption(
-        "--one-case", action="store_true", help="of each test the case of this week, as on ranks"
-    )
-
-
-def _one_case(config) -> bool:
-    return COMM.size > 1 or config.option.one_case
 
 
 def pytest_report_header(config):
-    lines = [f"cases: those of week {WEEK}"] if _one_case(config) else []
+    lines = [f"cases: those of week {WEEK}"]
     if kind := config.option.noise:
         lines.append(f"noise: {kind}, seed {config.option.noise_seed}")
     return lines
@@ -155,17 +148,22 @@ def pytest_collection_modifyitems(config, items):
     if not named and "PYTEST_XDIST_WORKER" not in os.environ and any(unknown.values()):
         missing = [f"{test}: {sorted(ids)}" for test, ids in unknown.items() if ids]
         raise pytest.UsageError("marks name no test: " + "; ".join(missing))
-    if _one_case(config) and not named:
-        _drop_cases(config, items)
+    if not named:
+        _choose_cases(config, items)
 
 
-def _drop_cases(config, items) -> None:
-    """Leave out all cases of a test but one of the fast and one of the slow."""
+def _choose_cases(config, items) -> None:
+    """Of a test's fast cases let one be fast; on ranks leave all out but a fast and a slow one."""
     cases: dict[tuple[str, bool], list] = {}
     for item in items:
         slow = item.get_closest_marker("slow") is not None
         cases.setdefault((item.nodeid.split("[")[0], slow), []).append(item)
     kept = {of_test[WEEK % len(of_test)] for of_test in cases.values()}
+    if COMM.size == 1:
+        for item in items:
+            if item not in kept:
+                item.add_marker(pytest.mark.slow)
+        return
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     items[:] = [item for item in items if item in kept]
 

@@ -153,6 +153,7 @@ def test_a_spinning_bar_keeps_what_it_should(integrator):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.Newmark(), nts.GeneralizedAlpha()])
+@pytest.mark.fast_on_ranks()
 def test_other_integrators(rule):
     """The path of the energy-momentum scheme up to the square of the step."""
     ends = []
@@ -172,6 +173,7 @@ def test_order_two():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_contact_with_friction_closes_the_ledger():
     a = body_of(box((0, 0, 0), (1.0, 1.0, 0.3), (3, 3, 1)), name="a", velocity=(0.5, 0.0, -3.0))
     ends = ((-0.1, -0.1, -0.304), (1.1, 1.1, -0.004))
@@ -192,6 +194,7 @@ def test_contact_with_friction_closes_the_ledger():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_restart_goes_on_from_the_modes(tmp_path_factory):
     """As if never stopped: the modes of t_n belong to the state."""
     folder = str(tmp_path_factory.mktemp("modes")) if COMM.rank == 0 else None

@@ -38,6 +38,7 @@ def bounce(body, integrator, t_end=0.012, output=()):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", RULES.values(), ids=RULES)
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_continuum_of_ones_own_forms(integrator):
     mesh = box()
     space = compat.vector_space(mesh, 1)

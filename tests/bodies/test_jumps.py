@@ -62,6 +62,7 @@ def test_constant_values_that_make_nodes_start_inside_say_so():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_bodies_that_start_where_they_are_held_are_no_jump():
     """The crash is of another cause: a body that is placed by `displacement` starts as meant."""
     system = scene((0, 0, 0.3), displacement=(0, 0, 0.3), velocity=(0, 0, -1e4))

@@ -587,6 +587,7 @@ def test_a_picture_of_skins(mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_shell_at_rest_sleeps():
     """With the constraints that hold its directors; the scene moves alike."""
     ends = []

@@ -141,6 +141,7 @@ def test_a_viscosity_that_changes():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_contact_of_viscous_bodies_closes_its_ledger():
     """A cube falls on a floor with friction, with and without mass at its lower side."""
     for mass in ("consistent", "redistributed"):

@@ -56,6 +56,7 @@ def test_a_block_beside_a_plate_rests_on_it_at_once(kind, sign):
         assert np.abs(table["min_gap"][-1]) < 1e-12 * unit and table["active"][-1] == 16
 
 
+@pytest.mark.fast_on_ranks()
 def test_it_stays_at_rest_in_time():
     """From the first instant, on its equilibrium and inside the plate; else it would fall."""
     system = block_on("plate", sign=-1.0, friction=0.3, adjust=1.001 * GAP)

@@ -42,6 +42,7 @@ def pressed(cells, poisson, slave, master, friction=0.0):
     [((1, 1), (0.3, 0.3), 0.0), ((4, 3), (0.3, 0.2), 0.0), ((2, 2), (0.3, 0.45), 0.0),
      ((3, 4), (0.3, 0.45), 0.3)],
 )  # fmt: skip
+@pytest.mark.fast_on_ranks()
 def test_nodes_at_the_rims_stay_with_the_face_that_they_face(cells, poisson, friction):
     """A side that no facet of the slave faces is none of its masters, whichever way rims move."""
     faces = pressed(cells, poisson, face, face, friction)

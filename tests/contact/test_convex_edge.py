@@ -103,6 +103,7 @@ def hexahedra(x, cells):
 @pytest.mark.parametrize("metre", [1.0, 2.0**-10])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("raised", [0.0, 1e-5, 3e-3])
+@pytest.mark.fast_on_ranks()
 def test_a_sharp_edge_that_slides_up_a_roof_passes_the_nodes_of_its_ridge(raised, friction, metre):
     """The ridge comes to the edge at its height, or deeper by what its middle node is raised.
 
@@ -147,6 +148,7 @@ def test_a_sharp_edge_that_slides_up_a_roof_passes_the_nodes_of_its_ridge(raised
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.3])
 @pytest.mark.parametrize("ahead", [0.01, 0.03, 0.09])
 @pytest.mark.fast("0.09-0.0")
+@pytest.mark.fast_on_ranks()
 def test_the_face_above_an_edge_does_not_catch_a_node_of_a_slope(ahead, friction):
     """Nodes of a hook's slope that the edge of a catch comes to just before they meet the face.
 

@@ -67,7 +67,7 @@ PAIRS = {
     ("cells", "degrees", "integration", "friction"), PAIRS.values(), ids=PAIRS
 )
 @pytest.mark.fast("27-sum", "10", "8-10")
-@pytest.mark.fast_on_ranks("27-sum", "10", "8-10")
+@pytest.mark.fast_on_ranks()
 def test_energy_and_momenta(cells, degrees, integration, friction):
     run = fly(thrown(cells, degrees, friction, integration=integration))
     assert_kept(run)

@@ -39,6 +39,7 @@ def crossed(angle, friction, metre=1.0, kind=None):
     (90.0, 0.4, None), (67.0, 0.0, None), (67.0, 0.4, nts.RigidBody),
 ])  # fmt: skip
 @pytest.mark.parametrize("rule", MID_STEP)
+@pytest.mark.fast_on_ranks()
 def test_crossed_edges_rebound_and_keep_energy_and_momenta(rule, angle, friction, kind):
     """Forces act between the edges alone: no node of either cube comes near the other one."""
     run = nts.simulate(
@@ -86,7 +87,7 @@ def bars(cells, **upper_options):
 @pytest.mark.mpi
 @pytest.mark.parametrize("cells", [6, 12, 24])
 @pytest.mark.fast("6")
-@pytest.mark.fast_on_ranks("6")
+@pytest.mark.fast_on_ranks()
 def test_crossed_bars_bounce(cells):
     """Without edges the upper bar falls through the lower one; no look finds them inside now."""
     system = bars(cells, velocity=(0, 0, -2.0))
@@ -96,6 +97,7 @@ def test_crossed_bars_bounce(cells):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_crossed_bars_that_are_pressed_together_rest_in_balance():
     """What presses the ends of the upper one is what its edge bears."""
     ends = nts.Dirichlet(lambda x: np.abs(x[1] - 0.1) > 0.6 - 1e-6, lambda t: (0, 0, -0.03 * t))
@@ -166,6 +168,7 @@ def test_a_surface_tips_about_the_rim_however_it_is_meshed(facets, front):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_run_goes_on_from_its_checkpoint_with_the_forces_of_edges(mpi_tmp_path):
     """To the bit in serial; on several ranks MUMPS rounds anew in every run."""
     path, rule = mpi_tmp_path / "edges.h5", nts.EnergyMomentum()
@@ -204,6 +207,7 @@ def cubes_with_aligned_rims(edges):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_flat_faces_whose_rims_meet_give_what_they_give_without_edges():
     """The lower row of nodes slides over the rim, which crosses the edges beside these nodes."""
     runs = [

@@ -70,6 +70,7 @@ def test_a_vertex_beside_an_edge_stays_out():
     assert max(deepest) < 1e-9 * SIZE
 
 
+@pytest.mark.fast_on_ranks()
 def test_what_is_far_apart_is_left_out(monkeypatch):
     """Bricks that meet two by two move to the bit as in steps that look at all of them."""
 

@@ -72,6 +72,7 @@ def forces(run):
 @pytest.mark.mpi
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.fast("shape3")
+@pytest.mark.fast_on_ranks()
 def test_dragged_from_stick_to_slip(shape):
     """Over more than a facet; the force is along and what Coulomb says."""
     run = dragged(0.3, shape, 0.3, 8)

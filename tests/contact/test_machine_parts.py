@@ -160,6 +160,7 @@ def seal(walls, friction, rolls=False):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.fast_on_ranks()
 def test_a_seal_in_a_groove_of_tetrahedra_is_squeezed_as_between_planes(friction):
     """Both of the groove's faces hold it at once."""
     planes, tetrahedra = (seal(walls, friction) for walls in ("planes", "tetrahedra"))
@@ -169,6 +170,7 @@ def test_a_seal_in_a_groove_of_tetrahedra_is_squeezed_as_between_planes(friction
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.1, 0.6])
+@pytest.mark.fast_on_ranks()
 def test_a_seal_that_friction_alone_keeps_from_rolling(friction):
     """What slid before it rubbed rolled away, and was given up after 25 iterations."""
     planes, tetrahedra = (seal(walls, friction, rolls=True) for walls in ("planes", "tetrahedra"))

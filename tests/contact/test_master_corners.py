@@ -60,6 +60,7 @@ def end(system):
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("kind", [nts.Continuum, nts.RigidBody])
+@pytest.mark.fast_on_ranks()
 def test_a_vertex_of_the_master_bounces_as_one_of_the_slave_does(kind, friction):
     runs = []
     for exchanged in (False, True):
@@ -130,6 +131,7 @@ def test_units_do_not_matter(metre, friction):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", [nts.Continuum, nts.RigidBody])
+@pytest.mark.fast_on_ranks()
 def test_an_edge_of_the_master_lies_on_a_face_of_the_slave(kind):
     """A prism with its edge down, between the nodes; it rebounds as if its nodes were slaves."""
     ends = []
@@ -158,6 +160,7 @@ def test_an_edge_of_the_master_lies_on_a_face_of_the_slave(kind):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", [nts.Continuum, nts.RigidBody])
+@pytest.mark.fast_on_ranks()
 def test_a_vertex_that_slides_over_facets_is_slowed_by_mu_g(kind):
     """v = v_0 - mu g t, of a cube that does not turn, over four facets, and the lines between."""
     friction, g, speed, last = 0.2, 9.81, 2.0, 0.5
@@ -178,6 +181,7 @@ def test_a_vertex_that_slides_over_facets_is_slowed_by_mu_g(kind):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_vertex_pressed_into_a_soft_block_bears_what_the_other_declaration_says():
     forces = []
     for exchanged in (False, True):
@@ -198,6 +202,7 @@ def test_a_vertex_pressed_into_a_soft_block_bears_what_the_other_declaration_say
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_run_goes_on_from_its_checkpoint_with_the_forces_of_vertices(mpi_tmp_path):
     """To the bit in serial; on several ranks MUMPS rounds anew in every run."""
     path, rule = mpi_tmp_path / "corners.h5", nts.EnergyMomentum()
@@ -242,6 +247,7 @@ def thrown_cubes(cells, exchanged=False, t_end=0.02, **options):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("cells", "t_end"), [((4, 5), 0.02), ((2, 5), 0.015), ((5, 3), 0.02)])
+@pytest.mark.fast_on_ranks()
 def test_flat_faces_give_what_they_give_without_corners(cells, t_end, monkeypatch):
     """Whichever is the finer: the master's rim is held by the slave's nodes that lie on it."""
     forces = []
@@ -320,6 +326,7 @@ def test_nodes_that_tilt_beyond_a_rim_are_not_thrown_out_when_they_return():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_rigid_face_that_falls_flat_is_held_at_its_corners():
     """Its face lies on one node of the slave; the other declaration is the measure."""
     found = []

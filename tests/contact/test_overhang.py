@@ -173,6 +173,7 @@ def slide(n, exchange=False, cells=(5, 3, 1), width=1.0, edges=True, dt=4e-3):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_block_that_tips_too_early():
     """By nodes alone it turns about the last of them and leaves the table too early: told."""
     run, _ = slide(1, width=0.38, edges=False)

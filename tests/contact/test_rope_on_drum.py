@@ -72,6 +72,7 @@ def test_the_polygon_is_the_capstan_equation_in_the_limit():
         (60, 0.5, "rectangle"),
     ],
 )
+@pytest.mark.fast_on_ranks()
 def test_tension_in_equilibrium(n, mu, shape):
     """Nothing presses at the start: how much each node may rub is known once the rope is taut."""
     system = rope_on_drum(n, mu, shape, (0, 0, -PULL))

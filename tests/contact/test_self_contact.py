@@ -243,6 +243,7 @@ def test_a_coil_spring_is_squeezed_until_it_closes():
     assert deepest(x, compat.geometry_dofmap(body.mesh)) < 0.01 * WIRE / ACROSS
 # ---- other bodies
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_shell_that_folds_keeps_momenta_and_the_ledger():
     """On its inner side, half a thickness from the middle surface."""
     leg, bend, gap, thickness = 8, 6, 0.2, 0.03

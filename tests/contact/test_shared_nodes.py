@@ -72,6 +72,7 @@ def test_a_shared_node_belongs_to_the_pair_that_is_declared_first():
     assert np.abs(carried - PRESSURE).max(initial=0.0) < 1e-8 * PRESSURE
 
 
+@pytest.mark.fast_on_ranks()
 def test_each_patch_slides_by_its_own_coefficient():
     friction = (0.4, 0.1)
     system = scene(friction, push=0.0, velocity=(1.0, 0.0, 0.0))

@@ -140,7 +140,7 @@ ON_RANKS = {"shell on obstacle", "shell on shell", "beam on continuum"}
     "case", [pytest.param(c, marks=[pytest.mark.mpi] if c in ON_RANKS else []) for c in CASES]
 )
 @pytest.mark.fast("shell on rigid", "shell on obstacle", "beam on beam")
-@pytest.mark.fast_on_ranks("shell on obstacle")
+@pytest.mark.fast_on_ranks()
 def test_impacts_keep_the_ledger_and_the_momenta(case):
     _, run = impact(case)
     balance = run.balance
@@ -157,7 +157,7 @@ def test_impacts_keep_the_ledger_and_the_momenta(case):
 @pytest.mark.parametrize(
     "case", ["shell on continuum", "rigid on beam", "shell on shell", "rigid on shell"]
 )
-@pytest.mark.fast_on_ranks("rigid on beam")
+@pytest.mark.fast_on_ranks()
 @pytest.mark.fast("rigid on beam")
 def test_what_is_hit_sleeps_until_then(case):
     """Beams, shells and rigid bodies, with what holds their directors; the motion is the same."""

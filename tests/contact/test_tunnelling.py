@@ -258,6 +258,7 @@ def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator)
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_body_that_came_from_beside_is_told_of_once_it_is_inside():
     """A cube that sinks below the plate's top before the plate, of which its sides are none."""
     body, top = plate(lambda t: (0.6 * np.sin(np.pi * t), 0.0, 0.0), thickness=1.0, cells=4)

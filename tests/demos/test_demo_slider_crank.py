@@ -18,6 +18,7 @@ def test_closed_kinematics():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_ten_steps():
     """Joints hold, and bearing, guide, spring, floor and gravity explain the momentum."""
     r = demo.main(rods=("flexible",), t_end=5e-3, cells=12)["flexible"]

@@ -268,6 +268,7 @@ def plates():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_plates_sleep_one_by_one(alone):
     seen = []
     for system in (plates(), alone(plates)):

@@ -90,6 +90,7 @@ def test_atwoods_machine(rule, friction):
 
 @rules
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_a_slack_cable_stops_a_weight_as_a_limit_does(rule):
     """Free fall until it is taut; then as a slider on a rail with an end, with the same loss."""
     load, cable, system = hung(length=WAY + 0.3)
@@ -346,6 +347,7 @@ def flying(**options):
     "options", [{}, {"friction": 0.2}, {"axial_stiffness": 500.0}], ids=["plain", "friction", "EA"]
 )
 @pytest.mark.fast("plain-midpoint", "friction-energy-momentum", "EA-energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_free_bodies_keep_their_momenta(rule, options):
     _, system = flying(**options)
     run = nts.simulate(system, rule, dt=2e-3, t_end=0.1)

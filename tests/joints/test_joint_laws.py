@@ -248,6 +248,7 @@ def test_a_controller_holds_an_angle(rule):
         assert_closed(run)
 
 
+@pytest.mark.fast_on_ranks()
 def test_a_motor_does_work():
     """A constant torque on a disc: w = T t/I, and its work is the energy."""
     _, system = disc(0.0, motor=lambda t, a, rate: 0.4)
@@ -417,6 +418,7 @@ def chain_with_laws(holding):
 
 
 @pytest.mark.parametrize("rule", [*MID_STEP.values(), *ACCELERATED.values()])
+@pytest.mark.fast_on_ranks()
 def test_laws_that_are_alike_do_what_each_does_alone(rule, monkeypatch):
     """Reactions by name, columns of the ledger and what each joint remembers."""
     holding, runs = rule in MID_STEP.values(), []

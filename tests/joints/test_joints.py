@@ -574,6 +574,7 @@ def at(body, x):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_points_of_a_flexible_body():
     """A cube on a ball joint, and a rod without mass between it and a rigid body."""
     soft, body = cube((0, 0, 0), "soft", velocity=(0.0, 0.0, 1.0)), brick("rigid", (2, 0.4, 0.5))

@@ -58,6 +58,7 @@ def scene(speed=SPEED, pull=0.0, metre=1.0, load=LOAD):
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", UNITS)
 @pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast_on_ranks()
 def test_it_stops_a_mass_after_its_way(rule, metre):
     """F s = m v^2/2, which leaves as F times the way of slip; then it rests."""
     force, energy = COEFFICIENT * LOAD, 0.5 * MASS * SPEED**2
@@ -83,6 +84,7 @@ def test_it_holds_up_to_its_bound(part, moves):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_run_goes_on_while_it_slips(mpi_tmp_path):
     """From a checkpoint; not with another load."""
     whole, system = scene()

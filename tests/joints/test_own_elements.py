@@ -149,6 +149,7 @@ def cube(low, name, velocity=(0.0, 0.0, 0.0), **options):
 @pytest.mark.parametrize("newton", [{}, {"linear_solver": "direct"}, {"linear_solver": "krylov"}])
 @pytest.mark.parametrize("damping", [0.0, 500.0])
 @pytest.mark.fast("500.0-newton2")
+@pytest.mark.fast_on_ranks()
 def test_a_spring_between_cubes(damping, newton, mpi_tmp_path):
     """Both momenta and the ledger, with what the damper takes as a column of its own."""
     a, b = cube((0, 0, 0), "a"), cube((1.6, 0.2, 0.1), "b", velocity=(2.0, 1.0, 0.0))

@@ -72,6 +72,7 @@ def tumbling(kind, metre=1.0):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", UNITS)
+@pytest.mark.fast_on_ranks()
 def test_energy_and_momenta_are_kept(metre):
     system = tumbling(StiffSpring, metre)
     run = nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=2.0, accuracy="exact")
@@ -98,6 +99,7 @@ def test_it_is_its_built_in_twin_with_every_integrator(rule):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_mass_comes_back_after_duffings_period():
     """T = 4 K(m)/w, w^2 = (k + q A^2)/M, m = q A^2/(2 M w^2): the error is of second order."""
     k, q, amplitude, mass = 40.0, 300.0, 0.4, 2.0

@@ -160,7 +160,7 @@ def test_cells_of_the_file_fill_the_body(cell, mpi_tmp_path):
 
 @mpi
 @pytest.mark.parametrize("cells, degree", [([1, 1, 1], 1), ([2, 1, 1], 2)])
-@pytest.mark.fast_on_ranks("cells0-1")
+@pytest.mark.fast_on_ranks()
 @pytest.mark.fast("cells0-1")
 def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], cells)
@@ -424,6 +424,7 @@ def test_bad_cadence(options, message):
 
 
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_a_place_that_cannot_be_written_stops_before_any_step(mpi_tmp_path):
     blocked = mpi_tmp_path / "file"
     if COMM.rank == 0:

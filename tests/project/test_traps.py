@@ -232,7 +232,7 @@ def test_one_facet_and_one_slave_cell(integrator, friction):
 
 
 @pytest.mark.parametrize("condense", [False, True])
-@pytest.mark.fast_on_ranks("True")
+@pytest.mark.fast_on_ranks()
 @pytest.mark.fast("True")
 def test_krylov_with_ranks_that_own_nothing(condense):
     newton = nts.Newton(linear_solver="krylov", condense=condense)
@@ -386,6 +386,7 @@ def test_a_failure_advises_only_where_its_text_does(told):
 
 
 @rubbing
+@pytest.mark.fast_on_ranks()
 def test_contacts_that_change_one_at_a_time_end_in_the_same_step(friction, monkeypatch):
     """What a second attempt does where the whole active set goes to and fro."""
     ends, imposed = [], []

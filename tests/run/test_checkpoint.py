@@ -611,6 +611,7 @@ def other_systems():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_another_system_is_refused(mpi_tmp_path):
     path = mpi_tmp_path / "run.h5"
     run(blocks(COMM), t_end=2 * DT, checkpoint=nts.Checkpoint(path, every=1))
@@ -963,6 +964,7 @@ class Signals:
 @pytest.mark.mpi
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.fast("15")
+@pytest.mark.fast_on_ranks()
 def test_a_signal_ends_the_step_and_the_run(number, mpi_tmp_path):
     path, table = mpi_tmp_path / "run.h5", BalanceCSV(mpi_tmp_path / "table.csv")
     handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]

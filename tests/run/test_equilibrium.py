@@ -392,6 +392,7 @@ def test_a_body_that_falls_for_ever_is_reported():
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", [1.0, 1e3])
 @pytest.mark.parametrize("stabilization", [0.1, 1e-2, 1e-6])
+@pytest.mark.fast_on_ranks()
 def test_a_pinned_wire_swings_down(stabilization, metre):
     """From 17 degrees below the horizontal; its stretch is far stiffer than its swing."""
     young, radius, pull = 2e11, 5e-4, 50.0

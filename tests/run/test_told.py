@@ -67,6 +67,7 @@ def test_the_spin_of_a_wire_about_its_axis_is_no_free_motion(cells):
     assert "nothing resists body 'wire'" in swings.status and abs(way @ axis) < 0.02
 
 
+@pytest.mark.fast_on_ranks()
 def test_a_body_that_slides_is_no_equilibrium():
     """A block pulled by up to twice what friction carries: half of it is reached at t = 1.5."""
     weight, mu = 1e3 * 9.81 * 0.1 * 0.05 * 0.02, 0.3
@@ -264,7 +265,7 @@ def test_restored_impulses_have_no_friction_and_say_so(friction):
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.fast_on_ranks("0.3")
+@pytest.mark.fast_on_ranks()
 @pytest.mark.fast("0.3")
 def test_a_weight_below_the_rounding_of_a_stiff_body_is_told(friction):
     """Dust on steel: the weight of 5e-9 N is lost in the forces of the plate's nodes."""

@@ -123,6 +123,7 @@ def touching(comm, petsc_options=None, **options):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_schur_complement_is_the_same_on_all_ranks_and_when_made_again():
     norms = []
     for comm in (COMM, MPI.COMM_SELF):
@@ -453,6 +454,7 @@ def thrown_cubes(comm, *cells):
 @pytest.mark.mpi
 @pytest.mark.parametrize("reuse", [False, True])
 @pytest.mark.fast("True")
+@pytest.mark.fast_on_ranks()
 def test_as_many_bodies_as_ranks_need_no_more_iterations_than_one_rank(reuse):
     counts, energy = [], []
     for comm in (COMM, MPI.COMM_SELF):

@@ -57,7 +57,7 @@ def by_place(body):
 @pytest.mark.parametrize("between", [None, "lid"])
 @pytest.mark.parametrize("options", [{}, {"reuse": True, "rtol": 1e-11}], ids=["exact", "reuse"])
 @pytest.mark.fast("exact-lid", "reuse-None")
-@pytest.mark.fast_on_ranks("exact-lid")
+@pytest.mark.fast_on_ranks()
 def test_same_equilibrium_as_with_mumps(between, options):
     """To 1e-9 of the largest displacement; supports to the bit, which a coarse grid would move."""
     found = []

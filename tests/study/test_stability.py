@@ -40,6 +40,7 @@ def doctored(run, column=None, by=0.0, **changes):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_good_run_is_completed(run, case):
     assert stability.judge(run, nts.EnergyMomentum(), case)[0] == "completed"
     assert run.balance["active"].max() > 0
