@@ -22,6 +22,7 @@ from dolfinx_nts.run.balance_table import Ledger
 from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.locking_watch import LockingWatch
 from dolfinx_nts.run.material_watch import MaterialWatch
+from dolfinx_nts.run.parts import Parts
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
@@ -53,8 +54,6 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
-#: Parts of a cut step that are solved until the next ones are twice as long.
-_WELL = 4
 #: First steps whose failure may come from how the run starts.
 _FIRST = 2
 #: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
@@ -260,29 +259,22 @@ class Stepper:
         dt = float(dt)
         self.system.check_alive()
         self.start(dt)
-        end, parts, depth = self.state.time + dt if end is None else end, 1, 0
-        well, enough, grown = 0, _WELL, False
-        while parts:
+        end, parts = self.state.time + dt if end is None else end, Parts(self.newton.max_retries)
+        while parts.left:
             try:
-                self._step(dt, end - (parts - 1) * dt)
+                self._step(dt, end - (parts.left - 1) * dt)
             except UserFunctionError:
                 raise
             except StepFailedError as failure:
-                if depth == self.newton.max_retries:
+                if not parts.cut():
                     raise
-                depth += 1
-                well, enough, grown = 0, enough * (1 + grown), False
                 self.solution.retries += 1
-                # An odd number: halves of halves would end where one of them has failed.
-                parts = 2 * parts + 1
-                dt = (end - self.state.time) / parts
+                dt = (end - self.state.time) / parts.left
                 logger.info("%s; retrying with dt=%.3g", failure, dt)
             else:
-                parts, well = parts - 1, well + 1
-                if depth and parts > 1 and well >= enough:
-                    parts, depth, well, grown = (parts + 1) // 2, depth - 1, 0, True
-                    dt = (end - self.state.time) / parts
-                yield not parts
+                if parts.take():
+                    dt = (end - self.state.time) / parts.left
+                yield not parts.left
 
     def start(self, dt: float) -> None:
         """Give prescribed coordinates the rate of their motion; later calls do nothing.
