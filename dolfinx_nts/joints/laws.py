@@ -256,7 +256,8 @@ def laws_on(
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: limits are not two numbers around 0 in this order.
+        ValueError: limits are not two numbers around 0 in this order, or the joint's motion is
+            prescribed, too.
     """
     given = {f"{word}friction": friction, f"{word}limits": limits}
     require_same(joint.comm, **given)
@@ -275,6 +276,11 @@ def laws_on(
         law = friction.law(names[0], turns)
         found.append((names[0], law, ("friction_dissipation", 1.0)))
     if limits is not None:
+        if joint.motion is not None:
+            raise ValueError(
+                f"{names[1]}={limits!r} of {joint.name!r}: its motion is prescribed, which no "
+                "limit stops; drop one of them"
+            )
         both = measure[2] * np.array(_both(names[1], limits))
         found.append((names[1], Limits(*both.tolist()), ("contact_defect", 1.0)))
     if motor is not None:

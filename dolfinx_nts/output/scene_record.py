@@ -12,8 +12,8 @@ from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.system import System
 from dolfinx_nts.types import Rows
 
-#: Options of bodies that are loads and supports.
-_LOADS = ("body_force", "traction", "bcs", "forces", "force", "torque")
+#: Options of bodies in which a restart may differ: loads, supports and viscosity.
+_LOADS = ("body_force", "viscosity", "traction", "bcs", "forces", "force", "torque")
 #: Differences that a refusal names.
 _NAMED = 5
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.

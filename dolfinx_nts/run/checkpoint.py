@@ -228,7 +228,8 @@ def restart(path: StrPath, system: System) -> Restart:
     )
     changed = scenes.differences(notes["loads"], scenes.loads(system))
     if changed:
-        text = f"the restart was given other loads or supports: {scenes.listed(changed)}"
+        what = scenes.listed(changed)
+        text = f"the restart was given other loads, supports or viscosities: {what}"
         made.warn("loads changed", notes["time"], len(changed), text)
     return made
 

@@ -357,6 +357,10 @@ def test_laws_that_let_go_ask_for_another_integrator(rule):
     [
         ({"friction": 0.3}, TypeError, r"friction=0\.3: pass nts\.JointFriction"),
         ({"limits": (0.2, 0.5)}, ValueError, r"limits=\(0\.2, 0\.5\): pass the smallest"),
+        (
+            {"limits": (-1.0, 0.2), "angle": lambda t: t}, ValueError,
+            r"limits=\(-1\.0, 0\.2\) of 'hinge': its motion is prescribed",
+        ),
         ({"limits": 1.0}, ValueError, r"limits=1\.0: pass the smallest"),
         ({"motor": 2.0}, TypeError, r"motor=2\.0: pass a function of time"),
     ],

@@ -720,7 +720,8 @@ def test_other_loads_are_told(pull, mpi_tmp_path):
     def scene(pull=1.0):
         cube = nts.Continuum(
             box(cells=2), nts.StVenantKirchhoff(1e6, 0.3), density=1e3, name="cube",
-            body_force=(0.0, 0.0, pull), bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
+            body_force=(0.0, 0.0, pull), viscosity=0.1 * pull,
+            bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
         )  # fmt: skip
         ball = nts.RigidBody.from_inertia(
             1.0, (1, 1, 1), centre=(5, 0, 0), force=(pull, 0, 0), torque=lambda t: (0, 0, pull),
@@ -735,7 +736,8 @@ def test_other_loads_are_told(pull, mpi_tmp_path):
     assert second.status == "completed" and ("loads changed" in second.warnings) == (pull != 1.0)
     if pull != 1.0:
         found = second.warnings["loads changed"]
-        assert found.worst == 2 and found.first == DT
+        assert found.worst == 3 and found.first == DT
+        assert "viscosity is 0.1 there and 0.2 here of 'cube'" in found.text
         assert "body_force[2] is 1.0 there and 2.0 here of 'cube'" in found.text
         assert "force[0] is 1.0 there and 2.0 here of 'ball'" in found.text
 
