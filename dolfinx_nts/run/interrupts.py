@@ -11,6 +11,10 @@ from typing import Any
 from mpi4py import MPI
 
 
+class Interrupted(Exception):
+    """A signal came within a step, by its name."""
+
+
 class Interrupts:
     """Notes the first signal while entered; a second one does what it did before.
 
@@ -46,6 +50,12 @@ class Interrupts:
         found = self._comm.allreduce(self._number, op=MPI.MAX)
         self._told = found > 0
         return signal.Signals(found).name if found else None
+
+    def check(self) -> None:
+        """Raise `Interrupted` where a signal has come to any rank. Collective."""
+        name = self.seen()
+        if name is not None:
+            raise Interrupted(name)
 
     def __exit__(self, *_: object) -> None:
         self._restore()

@@ -245,6 +245,7 @@ class LoadStepper(Stepper):
         state = replace(kept, v=self.solution.rates)
         try:
             for _ in range(_RELAXATIONS):
+                self.interrupts.check()
                 try:
                     if self._stabilization and not tried:
                         tried, problem.stabilization.share = True, 0.0

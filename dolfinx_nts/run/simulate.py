@@ -10,7 +10,7 @@ from typing import Any
 from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
-from dolfinx_nts.run.interrupts import Interrupts
+from dolfinx_nts.run.interrupts import Interrupted
 from dolfinx_nts.run.paced import paced
 from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.run_file import Saved
@@ -265,8 +265,8 @@ def run(
         adapt: How to choose the steps between, each of which is written.
         checkpoint: Where and how often to write what `restart` needs.
     """
-    with Interrupts(stepper.system.comm) as interrupts:
-        return _run(stepper, steps, output, progress, remedy, adapt, checkpoint, interrupts)
+    with stepper.interrupts:
+        return _run(stepper, steps, output, progress, remedy, adapt, checkpoint)
 
 
 def _run(
@@ -277,7 +277,6 @@ def _run(
     remedy: str,
     adapt: Adapt | None,
     checkpoint: Checkpoint | None,
-    interrupts: Interrupts,
 ) -> Solution:
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
@@ -288,7 +287,10 @@ def _run(
         try:
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
             with progress_bar(None if adapt else len(steps), progress and root) as bar:
-                signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
+                try:
+                    signal = _march(stepper, steps, output, started, adapt, bar, saver)
+                except Interrupted as within:
+                    signal = str(within)
             stepper.refuse_written()
             stepper.look(last=True)
             if signal is None:
@@ -341,7 +343,6 @@ def _march(
     adapt: Adapt | None,
     bar: Any,
     saver: Saver | None,
-    interrupts: Interrupts,
 ) -> str | None:
     """Make the steps and write them; tells the signal that ended them before.
 
@@ -376,7 +377,7 @@ def _march(
             bar.update()
         if saver is not None:
             saver.step()
-        signal = interrupts.seen()
+        signal = stepper.interrupts.seen()
         if signal is not None:
             return signal
     return None

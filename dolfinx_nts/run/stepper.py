@@ -19,6 +19,7 @@ from dolfinx_nts.petsc_compat import close_at_exit
 from dolfinx_nts.run import step_warnings
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
 from dolfinx_nts.run.balance_table import Ledger
+from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.locking_watch import LockingWatch
 from dolfinx_nts.run.material_watch import MaterialWatch
@@ -125,10 +126,9 @@ class Stepper:
         begun: Solution | None = of_file(start, system)
         given = petsc_options or {}
         self._restitution = float(restitution) if impact == "restored" else None
-        self._project_start = project_start
-        self._before_step = before_step
-        self.newton = newton or Newton()
-        self._materials = MaterialWatch(system)
+        self._project_start, self._before_step = project_start, before_step
+        self.newton, self._materials = newton or Newton(), MaterialWatch(system)
+        self.interrupts = Interrupts(system.comm)
         self._locking = LockingWatch(system, in_time=integrator.inertia)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(

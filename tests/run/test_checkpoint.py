@@ -31,6 +31,8 @@ import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
 from dolfinx_nts.output.scene_record import describe, differences
 from dolfinx_nts.output.state_file import CHECKPOINT, Numbering, previous, read, write
+from dolfinx_nts.run.load_steps import LoadStepper
+from dolfinx_nts.validation import StepFailedError
 
 COMM = MPI.COMM_WORLD
 DT, STEPS, EVERY = 2e-3, 14, 9
@@ -992,6 +994,28 @@ def test_a_signal_without_checkpoint_leaves_the_solution():
     found = run(floor(COMM), before_step=Signals(signal.SIGTERM))
     assert found.status.startswith("interrupted: SIGTERM") and "Checkpoint" in found.status
     assert len(found.rows) == 5
+
+
+@pytest.mark.mpi
+def test_a_load_step_ends_on_a_signal_between_its_relaxations(monkeypatch):
+    """The first relaxation of the second load step fails, and a signal comes meanwhile."""
+    held = nts.Dirichlet(lambda x: x[2] < 1e-9)
+    cube = nts.Continuum(box(cells=2), RUBBER, density=1e3, bcs=[held])
+    solve, relaxed = LoadStepper._solve, []
+
+    def failing(stepper, *arguments):
+        relaxed.append(stepper.state.time)
+        if relaxed[-1] > 0.0:
+            if COMM.rank == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+            raise StepFailedError("hard")
+        return solve(stepper, *arguments)
+
+    monkeypatch.setattr(LoadStepper, "_solve", failing)
+    system = nts.System([cube], gravity=(0, 0, -9.81))
+    found = nts.equilibrium(system, load_steps=2, stabilization=1.0)
+    assert found.status.startswith("interrupted: SIGTERM came before t=0.5;")
+    assert list(found.balance["time"]) == [0.0, 0.5] and relaxed.count(0.5) == 1
 
 
 @pytest.mark.mpi
