@@ -151,7 +151,7 @@ class Pictures:
         t = stepper.state.time
         if np.isclose(t, self.times).any():
             file = self.folder / f"time_{t:.1f}.png"
-            picture(stepper.system.bodies, file, colour="stress", view=(90.0, -90.0))
+            picture(stepper, file, colour="stress", view=(90.0, -90.0))
 
     def close(self, stepper: nts.Stepper) -> None:
         """Nothing to close."""
