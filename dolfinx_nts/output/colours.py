@@ -29,7 +29,10 @@ _NAMED = {
     "speed": ("viridis", "speed [{0}/s]"),
     "stress": ("plasma", "von Mises stress [{1}]"),
     "pressure": ("plasma", "contact pressure [{1}]"),
+    "body": ("Set2", ""),
 }
+#: Colours of the map that bodies have one each of.
+_BODIES = 8
 #: Units of stress by those of length.
 UNITS = {"m": "Pa", "mm": "MPa"}
 
@@ -38,7 +41,7 @@ def check_colour(colour: Any, bodies: Sequence[Any], run: Any) -> None:
     """Raise unless a colour is known, and a body has it."""
     if not callable(colour):
         require_one_of("colour", colour, _NAMED)
-    if colour == "speed":
+    if colour in ("speed", "body"):
         return
     solids = [b for b in bodies if b.mesh.topology.dim == 3]
     what, has = "a material", [b for b in solids if b.law is not None]
@@ -53,6 +56,11 @@ def check_colour(colour: Any, bodies: Sequence[Any], run: Any) -> None:
     if not has:
         names = [b.name for b in bodies]
         raise ValueError(f"colour={colour!r}: none of {names} has {what}; colour by 'speed'")
+
+
+def number(k: int) -> float:
+    """Value of body k where each has a colour of its own."""
+    return float(k % _BODIES)
 
 
 def at_corners(
@@ -128,7 +136,7 @@ class Scale(NamedTuple):
     Attributes:
         limits: Its ends.
         map: Name of matplotlib's colour map.
-        text: What the colours are, with the unit.
+        text: What the colours are, with the unit; empty: there is nothing to read off.
         beyond: Whether values lie below and above it.
     """
 
@@ -155,6 +163,8 @@ def scale_of(values: FloatArray, colour: Colour, limits: Any, units: str) -> Sca
         limits: Ends of the scale, or None.
         units: Of lengths.
     """
+    if colour == "body":
+        return Scale((-0.5, _BODIES - 0.5), *_NAMED["body"], (False, False))
     values = values[np.isfinite(values)]
     size = float(np.abs(values).max(initial=0.0))
     there = values[np.abs(values) > _NONE * size]

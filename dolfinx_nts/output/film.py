@@ -24,8 +24,8 @@ from dolfinx_nts.validation import StrPath, as_path, require_bool
 #: largest are left out.
 _LONGEST, _LEAST = 0.2, 0.02
 _COLOUR = "crimson"
-#: Frames per second.
-_PACE = 15.0
+#: Dots per inch, and frames per second.
+_DOTS, _PACE = 80, 15.0
 
 
 class _Frame(NamedTuple):
@@ -132,7 +132,7 @@ class Film:
         image = importlib.import_module("PIL.Image")  # matplotlib's own need
         colour, view, limits, width, units = self._look
         every = [frame.seen for frame in self._frames]
-        painter = Painter(every, colour, limits, Look(view, width, units))
+        painter = Painter(every, colour, limits, Look(view, width, units, _DOTS))
         flat = [frame.forces @ painter.turn[:, :2] for frame in self._frames]
         largest = max(np.linalg.norm(f, axis=1).max(initial=0.0) for f in flat)
         low, high = painter.ends
@@ -142,7 +142,7 @@ class Film:
             figure = painter.figure(k, f"t = {frame.time:.4g} s")
             places = frame.places @ painter.turn[:, :2]
             _arrows(figure.axes[0], places, metres * forces, _LEAST * metres * largest)
-            figure.set_dpi(80)
+            figure.set_dpi(_DOTS)
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             images.append(image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))

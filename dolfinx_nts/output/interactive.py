@@ -67,7 +67,7 @@ def _plotter(now: Seen, colour: Colour, limits: Any, units: str) -> Any:
         plotter.add_mesh(
             _facets(drawn.corners), name=drawn.name, scalars=drawn.values.ravel(),
             clim=scale.limits, cmap=scale.map, nan_color=_GREY, show_edges=True,
-            scalar_bar_args={"title": scale.text},
+            scalar_bar_args={"title": scale.text}, show_scalar_bar=bool(scale.text),
         )  # fmt: skip
     ((corners, _),) = obstacle_facets([now])
     if len(corners):

@@ -12,15 +12,16 @@ from dolfinx_nts.output.colours import Colour, scale_of
 from dolfinx_nts.output.seen import Drawn, Seen, obstacle_facets
 from dolfinx_nts.types import FloatArray
 
-#: About how many patches bodies and obstacles are made of: more hide hidden faces better.
-_PATCHES = 20000
+#: About how many patches bodies and obstacles are made of, for each dot per inch: more hide hidden
+#: faces better.
+_PATCHES = 100
 #: Direction of the light in (right, up, towards the viewer).
 _LIGHT = np.array([-0.35, 0.55, 0.76])
 #: Colours of facets without a value, of obstacles, edges of facets, lines, points and axes.
 _GREY, _OBSTACLE, _RIM, _LINE, _MARK = "0.72", (0.93, 0.93, 0.9), (0, 0, 0, 0.5), "0.15", "crimson"
 #: Half the length of an axis, as part of the smaller side of a picture; the least part that this
-#: is of the larger one.
-_AXIS, _THIN = 0.07, 0.05
+#: is of the larger one; the least height of what is drawn [inch].
+_AXIS, _THIN, _HEIGHT = 0.07, 0.05, 1.4
 
 
 class Look(NamedTuple):
@@ -30,11 +31,13 @@ class Look(NamedTuple):
         view: Elevation above the x-y plane and azimuth from the x axis, of the viewer [degrees].
         width: Of what is drawn [inch].
         units: Of lengths.
+        dots: Per inch.
     """
 
     view: tuple[float, float]
     width: float
     units: str
+    dots: int
 
 
 def axes_of(elevation: float, azimuth: float) -> FloatArray:
@@ -69,8 +72,10 @@ class Painter:
         points += [corners.reshape(-1, 3) for corners, _ in self._obstacles]
         flat = np.concatenate(points) @ self.turn[:, :2]
         low, high = flat.min(axis=0), flat.max(axis=0)
-        # A line seen from aside still has a figure.
-        thin = np.maximum(_THIN * (high - low).max() - (high - low), 0.0)
+        # A line seen from aside still has a figure, and the text of the colour bar has its height.
+        sides = high - low
+        least = np.array([_THIN * sides[1], max(_THIN, _HEIGHT / look.width) * sides[0]])
+        thin = np.maximum(least - sides, 0.0)
         self.ends = low - 0.5 * thin, high + 0.5 * thin
 
     def figure(self, k: int, title: str, labels: bool = False) -> Any:
@@ -84,7 +89,7 @@ class Painter:
         colours.colorbar_extend = scale.extend
         mappable = ScalarMappable(Normalize(*scale.limits), colours)
         figure, axes = _figure(self.ends, look, title)
-        axes.add_collection(_shapes(now, self._obstacles[k], mappable, self.turn))
+        axes.add_collection(_shapes(now, self._obstacles[k], mappable, self.turn, look.dots))
         _mark(axes, now, self.turn)
         _furnish(figure, axes, mappable, scale.text, look, now.drawn if labels else ())
         return figure
@@ -144,7 +149,8 @@ def _lit(rgba: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def _shapes(
-    now: Seen, obstacles: tuple[FloatArray, FloatArray], mappable: Any, turn: FloatArray
+    now: Seen, obstacles: tuple[FloatArray, FloatArray], mappable: Any, turn: FloatArray,
+    dots: int,
 ) -> Any:
     """What faces the viewer, and lines, from back to front."""
     from matplotlib.collections import PolyCollection
@@ -162,15 +168,16 @@ def _shapes(
     area = 0.5 * np.linalg.norm(np.cross(diagonals[:, 0], diagonals[:, 1]), axis=1)
     lines = now.sketch.lines @ turn
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
-    size = math.sqrt(2 * float(area.sum()) / _PATCHES) or float(lengths.max(initial=1.0))
+    size = math.sqrt(2 * float(area.sum()) / (_PATCHES * dots)) or float(lengths.max(initial=1.0))
     x, value, rim = _cut(corners, values, size)
     wall, normal, _ = _cut(walls, np.repeat(normals[:, None], 4, axis=1), size)
     rod, _, _ = _cut(_flat(lines[:, 0], lines[:, 1]), np.zeros((len(lines), 4)), size)
+    dot = 72.0 / dots
     each = [
         # What is drawn, its colours, widths of its lines, and how much nearer it counts: edges
         # else vanish below the patches beside them, and bodies in the floor that they stand on.
-        (wall, _lit(np.tile(to_rgba(_OBSTACLE), (len(wall), 1)), normal), 0.35, -1.0),
-        (x, _lit(mappable.to_rgba(value), _normals(x)), 0.35, 0.0),
+        (wall, _lit(np.tile(to_rgba(_OBSTACLE), (len(wall), 1)), normal), dot, -1.0),
+        (x, _lit(mappable.to_rgba(value), _normals(x)), dot, 0.0),
         (rim, np.tile(to_rgba(_RIM), (len(rim), 1)), 0.35, 0.5),
         (rod, np.tile(to_rgba(_LINE), (len(rod), 1)), 1.3, 1.0),
     ]  # fmt: skip
@@ -188,10 +195,11 @@ def _mark(axes: Any, now: Seen, turn: FloatArray) -> None:
         n = half * direction / np.linalg.norm(direction)
         ends = np.array([place - n, place + n]) @ turn
         axes.plot(*ends[:, :2].T, color=_MARK, linewidth=1.2, linestyle="-.", zorder=4)
-    if len(now.sketch.points):
-        x, y, _ = turn.T @ now.sketch.points.T
-        look = {"s": 16, "facecolors": "white", "edgecolors": _LINE, "linewidths": 1.0}
-        axes.scatter(x, y, zorder=4.5, clip_on=False, **look)
+    x = now.sketch.points @ turn[:, :2]
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    there = ((x >= [left, low]) & (x <= [right, high])).all(axis=1)
+    look = {"s": 16, "facecolors": "white", "edgecolors": _LINE, "linewidths": 1.0}
+    axes.scatter(*x[there].T, zorder=4.5, clip_on=False, **look)
 
 
 def _figure(ends: tuple[FloatArray, FloatArray], look: Look, title: str) -> tuple[Any, Any]:
@@ -221,11 +229,12 @@ def _furnish(
     total, box = figure.get_size_inches(), axes.get_position()
     height = min(box.height, max(0.8 * box.height, 2.0 / total[1]))
     place = (box.x1 + 0.2 / total[0], box.y0 + (box.height - height) / 2, 0.14 / total[0], height)
-    bar = figure.colorbar(mappable, cax=figure.add_axes(place))
-    bar.set_label(text, fontsize=9)
-    bar.ax.tick_params(labelsize=8)
-    bar.formatter.set_powerlimits((-2, 4))
-    bar.outline.set_visible(False)
+    if text:
+        bar = figure.colorbar(mappable, cax=figure.add_axes(place))
+        bar.set_label(text, fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+        bar.formatter.set_powerlimits((-2, 4))
+        bar.outline.set_visible(False)
 
     # Not figure.dpi_scale_trans, which bbox_inches="tight" leaves behind.
     inch = Affine2D().scale(*1 / total) + figure.transFigure

@@ -20,6 +20,9 @@ from dolfinx_nts.validation import (
     require_positive,
 )
 
+#: Per inch.
+_DOTS = 200
+
 
 def picture(
     scene: Any,
@@ -47,6 +50,7 @@ def picture(
         colour: "speed" [m/s], "stress" (von Mises of the Cauchy stress) [Pa], "pressure" of contact
             on slaves [Pa], for which the scene is a run; or a function of a body with a material
             that returns a scalar Function in cells or at nodes. Bodies without the colour are grey.
+            "body": each has one of its own.
         title: Text above the picture.
         labels: Whether to write the bodies' names beside them.
         view: Elevation above the x-y plane and azimuth from the x axis, of the viewer [degrees].
@@ -68,9 +72,9 @@ def picture(
     now = seen(given, colour)
 
     def draw() -> None:
-        painter = Painter([now], colour, limits, Look(view, width, units))
+        painter = Painter([now], colour, limits, Look(view, width, units, _DOTS))
         figure = painter.figure(0, title, labels)
-        save_figure(figure, file, dpi=200, bbox_inches="tight", pad_inches=0.05)
+        save_figure(figure, file, dpi=_DOTS, bbox_inches="tight", pad_inches=0.05)
 
     write_on_root(given.bodies[0].comm, f"path={str(path)!r}", draw)
 

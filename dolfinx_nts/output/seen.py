@@ -14,11 +14,15 @@ from dolfinx_nts.contact.linear_facets import body_facets, node_places
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.interaction.sketch import Sketch, joined
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.output.colours import Colour, at_corners
+from dolfinx_nts.output.colours import Colour, at_corners, number
 from dolfinx_nts.parallel import gather_on_root
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items
+
+#: How far from the bodies' box obstacles and ends of springs may be to have room in a picture, as
+#: part of its diagonal.
+_FAR = 1.0
 
 
 class Given(NamedTuple):
@@ -91,20 +95,28 @@ class Seen(NamedTuple):
 
     @property
     def points(self) -> FloatArray:
-        """All that is drawn but for obstacles [m], shape (n, 3)."""
-        return np.concatenate([d.corners.reshape(-1, 3) for d in self.drawn]
-                              + [a.reshape(-1, 3) for a in self.sketch[:2]])  # fmt: skip
+        """Bodies, and what of joints is not far from them [m], shape (n, 3)."""
+        bodies = np.concatenate([np.empty((0, 3)), *(d.corners.reshape(-1, 3) for d in self.drawn)])
+        others = np.concatenate([a.reshape(-1, 3) for a in self.sketch[:2]])
+        if not len(bodies):
+            return others
+        low, high = bodies.min(axis=0), bodies.max(axis=0)
+        away = np.linalg.norm(others - others.clip(low, high), axis=1)
+        return np.concatenate([bodies, others[away <= _FAR * np.linalg.norm(high - low)]])
 
 
 def seen(given: Given, colour: Colour) -> Seen:
     """What is to be seen now. Collective."""
     drawn, sketches = [], []
-    for body in given.bodies:
+    for k, body in enumerate(given.bodies):
         if not _has_facets(body):
             sketches.append(Sketch(lines=gather_on_root(body.comm, _edges(body))))
             continue
-        found = _facets(body, colour, given.run)
-        drawn.append(Drawn(body.name, *(gather_on_root(body.comm, a) for a in found)))
+        corners, values = _facets(body, "speed" if colour == "body" else colour, given.run)
+        if colour == "body":
+            values = np.full_like(values, number(k))
+        both = (gather_on_root(body.comm, a) for a in (corners, values))
+        drawn.append(Drawn(body.name, *both))
     if given.system is None:
         return Seen(drawn, joined(sketches), [])
     comm = given.system.comm
@@ -156,9 +168,9 @@ def _facets(body: Any, colour: Colour, run: Any) -> tuple[FloatArray, FloatArray
 
 
 # ---- obstacles
-#: Cells along the longest side of the box in which obstacles are drawn, what it is larger by than
-#: the bodies' own, and how far obstacles may be from that, as parts of its diagonal.
-_CELLS, _MARGIN, _FAR = 48, 0.08, 1.0
+#: Cells along the longest side of the box in which obstacles are drawn, and what it is larger by
+#: than the bodies' own, as part of its diagonal.
+_CELLS, _MARGIN = 48, 0.08
 
 
 def obstacle_facets(everything: Sequence[Seen]) -> list[tuple[FloatArray, FloatArray]]:
