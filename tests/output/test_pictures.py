@@ -234,3 +234,15 @@ def test_pressure_of_what_has_no_contact(tmp_path):
     system = standing()
     with pytest.raises(ValueError, match=r"colour='pressure': a scene has no contact forces; pass"):
         picture(system, tmp_path / "p.png", colour="pressure")
+
+
+def test_each_body_has_a_colour_of_its_own():
+    """Also a rigid one, without anything to read off; the ninth has that of the first."""
+    bodies = [
+        nts.RigidBody(box((2 * k, 0, 0), (2 * k + 1, 1, 1), 1), density=1.0, name=f"body {k}")
+        for k in range(9)
+    ]
+    drawn = seen(Given.of("scene", bodies), "body").drawn
+    values = [set(d.values.ravel()) for d in drawn]
+    assert all(len(of) == 1 for of in values) and len(set().union(*values)) == 8
+    assert values[8] == values[0] and scale_of(drawn[0].values, "body", None, "m").text == ""
