@@ -214,7 +214,7 @@ def main(
         writers = [
             BalanceCSV(folder / "balance.csv"),
             Fields(folder, interval=0.05),
-            Film(folder / "film.gif", interval=0.05),
+            Film(folder / "film.gif", interval=0.05, colour="stress", view=(90.0, -90.0)),
             Pictures(folder, (*BAND, end)),
         ]
     clock = time.perf_counter()

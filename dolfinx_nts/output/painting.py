@@ -259,9 +259,16 @@ def _furnish(
     length = max(k * power for k in (1, 2, 5) if k * power * metre <= 1.5)
     line((1.1, 0.3), (1.1 + length * metre, 0.3), arrowstyle="-", lw=1.5, shrinkA=0, shrinkB=0)
     axes.text(1.1, 0.36, f"{length:g} {look.units}", fontsize=8, transform=inch)
-    for body in named:
-        x, y = (body.corners.reshape(-1, 3).mean(axis=0) @ turn.T)[:2]
-        axes.annotate(body.name, (x, y), fontsize=9, ha="center", bbox=_NAME_BOX)
+    there: list[FloatArray] = []
+    middles = [((d.corners.reshape(-1, 3).mean(axis=0) @ turn.T)[:2], d.name) for d in named]
+    for x, name in sorted(middles, key=lambda middle: middle[0][1]):
+        # Names of bodies at one place stand above each other, in the bodies' order.
+        while any((np.abs(metre * (x - y)) < _NAME_SIZE).all() for y in there):
+            x = x + [0.0, _NAME_SIZE[1] / metre]
+        there.append(x)
+        axes.annotate(name, x, fontsize=9, ha="center", bbox=_NAME_BOX)
 
 
+#: Room that a name takes [inch].
+_NAME_SIZE = np.array([0.6, 0.2])
 _NAME_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
