@@ -36,7 +36,8 @@ class Scene(NamedTuple):
         end: Time up to which it runs [s]; None: all of it.
         colour: As of `picture`.
         limits: As of `picture`.
-        only: The bodies that are drawn; none: all.
+        units: As of `picture`.
+        only: The bodies that are drawn, alone; none: all that is in the scene.
     """
 
     test: str
@@ -46,8 +47,12 @@ class Scene(NamedTuple):
     end: float | None = None
     colour: str = "speed"
     limits: tuple[float, float] | None = None
+    units: str = "m"
     only: tuple[str, ...] = ()
 
+
+#: With which the lump hangs between the fingers: 0.95 of what their friction holds [N].
+LOAD = 0.36
 
 SCENES = {
     "gears": Scene(
@@ -59,16 +64,19 @@ SCENES = {
     ),
     "hooks": Scene(
         "test_real_parts", "test_hooks_hold_each_other", {"size": 1.5, "friction": 0.3},
-        (12.0, -50.0), colour="stress",
+        (12.0, -50.0), colour="stress", units="mm",
     ),
-    "chain": Scene("test_machine_parts", "test_links_of_a_chain_carry_one_force", {"links": 5}),
+    "chain": Scene(
+        "test_machine_parts", "test_links_of_a_chain_carry_one_force", {"links": 5}, colour="body",
+        units="mm", only=tuple(f"link {k}" for k in range(5)),
+    ),
     "coil_spring": Scene(
         "test_self_contact", "test_a_coil_spring_is_squeezed_until_it_closes", {}, (12.0, -60.0),
-        colour="stress",
+        colour="stress", limits=(0.0, 1.2e4),
     ),
     "peg": Scene(
         "test_peg", "test_a_peg_jams_if_friction_is_above_that_of_the_drawer",
-        {"part": 1.2, "exchanged": False}, (12.0, -75.0), limits=(0.0, 1.0),
+        {"part": 1.2, "exchanged": False}, (12.0, -75.0), colour="body",
     ),
     "block_over_a_rim": Scene("test_edge_contact", "slide", {"facets": (4, 1)}, (10.0, -70.0)),
     "cube_edge_on_edge": Scene(
@@ -85,9 +93,9 @@ SCENES = {
     ),
     "wedge": Scene(
         "test_machine_parts", "test_a_wedge_lifts_a_rigid_block_as_a_screw_does_its_nut",
-        {"friction": 0.2, "exchanged": False}, (12.0, -75.0),
+        {"friction": 0.2, "exchanged": False}, (12.0, -75.0), colour="body",
     ),
-    "gripper": Scene("test_gripper", "gripped", {"load": 0.0}, (15.0, -75.0), 0.1),
+    "gripper": Scene("test_gripper", "gripped", {"load": LOAD}, (15.0, -75.0), colour="stress"),
     "snap_fit": Scene(
         "test_machine_parts", "test_a_snap_fit_of_two_solids_takes_the_force_that_beams_say",
         {"kind": "soft", "exchanged": False}, (8.0, -80.0), colour="stress",
@@ -95,7 +103,7 @@ SCENES = {
     "beams": Scene("test_thin_contact", "impact", {"case": "beam on beam"}, (20.0, -60.0)),
     "o_ring": Scene(
         "test_machine_parts", "seal", {"walls": "tetrahedra", "friction": 0.3, "rolls": True},
-        (12.0, -75.0), colour="stress", only=("cord",),
+        (30.0, -75.0), colour="stress", units="mm", only=("cord", "groove"),
     ),
 }  # fmt: skip
 
@@ -122,13 +130,13 @@ def draw(name: str, folder: Path) -> Path:
         def run(system: Any, *args: Any, solve: str = solve, **options: Any) -> Any:
             if scene.end is not None:
                 options["t_end"] = scene.end
-            whole[solve](system, *args, **options)
-            bodies = [b for b in system.bodies if not scene.only or b.name in scene.only]
+            done = whole[solve](system, *args, **options)
             picture(
-                bodies, path, colour=scene.colour, view=scene.view, limits=scene.limits, width=2.4
-            )
-            # Few colours take a quarter of the bytes.
-            Image.open(path).convert("RGB").quantize(96).save(path, optimize=True)
+                [b for b in system.bodies if b.name in scene.only] or done, path, width=2.4,
+                colour=scene.colour, view=scene.view, limits=scene.limits, units=scene.units,
+            )  # fmt: skip
+            # Few colours take a third of the bytes.
+            Image.open(path).convert("RGB").quantize(160).save(path, optimize=True)
             raise _Drawn
 
         setattr(nts, solve, run)

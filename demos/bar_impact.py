@@ -254,7 +254,7 @@ def main(
             system, INTEGRATORS[name], dt=dt, t_end=end, output=writers, progress=progress
         )
         if folder:
-            picture(system.bodies, folder / "bar.png", colour="stress")
+            picture(run, folder / "bar.png", colour="stress")
         results[name] = figures(run, recorder, dt, gravity)
         results[name]["seconds"] = time.perf_counter() - clock
         balances[name] = run.balance

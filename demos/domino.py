@@ -282,7 +282,7 @@ def main(
     )  # fmt: skip
     r = figures(run, tilts, dominoes, friction) | {"seconds": time.perf_counter() - clock}
     if folder:
-        picture(system.bodies, folder / "dominoes.png", view=(15.0, -70.0))
+        picture(run, folder / "dominoes.png", view=(15.0, -70.0))
     if comm.rank == 0:
         report(r, dominoes)
         if folder:

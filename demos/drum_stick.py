@@ -146,7 +146,7 @@ def main(
         for name, value in result.items():
             print(f"{name:16} {value}")
     if output:
-        picture(system.bodies, Path(output) / "drum_stick.png", labels=True)
+        picture(run, Path(output) / "drum_stick.png", labels=True)
         if comm.rank == 0:
             plot(path, Path(output) / "heights.png")
     return result

@@ -115,7 +115,7 @@ def main(
                 output=writers,
             )  # fmt: skip
             if folder:
-                picture(system.bodies, folder / "beam.png")
+                picture(run, folder / "beam.png")
             results[name, dt], balances[f"{name}, h = {dt:g}"] = figures(run), run.balance
             results[name, dt]["seconds"] = time.perf_counter() - clock
     if comm.rank == 0:

@@ -136,7 +136,7 @@ def main(
         results[name], balances[name] = figures(run), run.balance
         results[name]["seconds"] = time.perf_counter() - clock
         if output is not None:
-            picture(system.bodies, str(Path(output) / f"block_{name}.png"), colour="speed")
+            picture(run, str(Path(output) / f"block_{name}.png"), colour="speed")
     if comm.rank == 0:
         report(results, dt)
     if comm.rank == 0 and output is not None:

@@ -94,7 +94,7 @@ def main(
                 output=writers,
             )  # fmt: skip
             if folder:
-                picture(system.bodies, folder / "plate.png")
+                picture(run, folder / "plate.png")
             results[name, dt], balances[f"{name}, h = {dt:g}"] = figures(run), run.balance
             results[name, dt]["seconds"] = time.perf_counter() - clock
     if comm.rank == 0:

@@ -255,7 +255,7 @@ def main(
         film = Film(folder / "film.gif", interval=max(t_end / 50, dt), view=(8.0, 20.0))
         writers = [Fields(folder, interval=max(t_end / 50, dt)), film]
         results["meshed"] = {dt: run(system, dt, steady, writers)}
-        picture(system.bodies, folder / "top.png", title=f"t = {t_end:g} s", view=(8.0, 20.0))
+        picture(system, folder / "top.png", title=f"t = {t_end:g} s", view=(8.0, 20.0))
         if comm.rank == 0:
             plot(results, folder)
     if comm.rank == 0:

@@ -342,8 +342,7 @@ def at_each_scale(name, problem, solve, figures, *, comm, output, scales, refine
         folder = output and Path(output) / f"{name}_{scale:g}"
         run = solve(comm, at, output=[Fields(folder)] if folder else [], progress=progress)
         if folder:
-            bodies = run.system.bodies
-            picture(bodies, folder / "stress.png", colour="stress", view=(10.0, -75.0))
+            picture(run, folder / "stress.png", colour="stress", view=(10.0, -75.0))
         results[scale] = figures(at, run)
         results[scale]["seconds"] = time.perf_counter() - clock
         if comm.rank == 0:

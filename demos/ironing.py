@@ -151,7 +151,7 @@ class Pictures:
         t = stepper.state.time
         if np.isclose(t, self.times).any():
             file = self.folder / f"time_{t:.1f}.png"
-            picture(stepper.system.bodies, file, colour="stress", view=(90.0, -90.0))
+            picture(stepper, file, colour="stress", view=(90.0, -90.0))
 
     def close(self, stepper: nts.Stepper) -> None:
         """Nothing to close."""
@@ -214,7 +214,7 @@ def main(
         writers = [
             BalanceCSV(folder / "balance.csv"),
             Fields(folder, interval=0.05),
-            Film(folder / "film.gif", interval=0.05),
+            Film(folder / "film.gif", interval=0.05, colour="stress", view=(90.0, -90.0)),
             Pictures(folder, (*BAND, end)),
         ]
     clock = time.perf_counter()

@@ -191,7 +191,7 @@ def main(
         for name, value in result.items():
             print(f"{name:20} {value}")
     if output:
-        picture(run.system.bodies, folder / "leaf_spring.png", labels=True)
+        picture(run, folder / "leaf_spring.png", colour="body", labels=True)
         if comm.rank == 0:
             plot(loads, deflection, path, folder / "loop.png")
     return result

@@ -255,7 +255,7 @@ def main(
                 output=writers,
             )  # fmt: skip
             if folder:
-                picture(system.bodies, folder / "balls.png", view=(20.0, -70.0))
+                picture(run, folder / "balls.png", view=(20.0, -70.0))
             seconds = time.perf_counter() - clock
             results.setdefault(kind, {})[theta] = figures(run, path) | {"seconds": seconds}
     if comm.rank == 0:

@@ -284,7 +284,7 @@ def main(
             start_time=0.0,
         )
         if folder:
-            picture(system.bodies, folder / "wheel.png", view=(10.0, -75.0))
+            picture(run, folder / "wheel.png", view=(10.0, -75.0))
         results[name] = figures(run, wheel)
         results[name]["seconds"] = time.perf_counter() - clock
         balances[name] = run.balance

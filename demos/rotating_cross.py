@@ -127,7 +127,7 @@ def main(
                 petsc_options=LINE_SEARCH, progress=progress, output=writers,
             )  # fmt: skip
             if folder:
-                picture(system.bodies, folder / "cross.png", colour="stress")
+                picture(run, folder / "cross.png", colour="stress")
             results[name, dt], balances[f"{name}, h = {dt:g}"] = figures(run), run.balance
             results[name, dt]["seconds"] = time.perf_counter() - clock
     if comm.rank == 0:

@@ -302,8 +302,7 @@ def main(
             system, nts.EnergyMomentum(), dt=dt, t_end=t_end, progress=progress, output=writers,
         )  # fmt: skip
         if folder:
-            drawn = [body for body in system.bodies if body.mesh is not None]
-            picture(drawn, folder / "mechanism.png", view=(50.0, -80.0))
+            picture(run, folder / "mechanism.png", view=(50.0, -80.0))
         results[kind] = figures(run, path) | {"seconds": time.perf_counter() - clock}
         balances[kind] = run.balance
     if comm.rank == 0:

@@ -203,7 +203,7 @@ def slide(
         progress=progress,
     )
     if folder:
-        picture(scenery.bodies, folder / "block.png", colour="stress")
+        picture(run, folder / "block.png", colour="stress")
     time, way, speed = np.array(centre.rows).T
     return Motion(time, way - way[0], speed, run)
 

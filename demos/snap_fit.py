@@ -186,9 +186,7 @@ def main(
     still = insert(comm, cells, steps, [Fields(folder / "insert")] if output else [], progress)
     result, run = figures(still), None
     if output:
-        picture(
-            still.system.bodies, folder / "snap_fit.png", labels=True, view=(8.0, -80.0)
-        )
+        picture(still, folder / "snap_fit.png", colour="body", labels=True, view=(8.0, -80.0))
     if t_end > 0.0:
         writers = []
         if output:

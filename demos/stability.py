@@ -93,7 +93,7 @@ def main(*, comm=MPI.COMM_WORLD, output=None, steps=STEPS, integrators=tuple(INT
             )  # fmt: skip
             results[scene][name], balances[name] = figures(run), run.balance
             if folder:
-                picture(case.system.bodies, str(folder / f"{name}.png"), colour="speed")
+                picture(run, str(folder / f"{name}.png"), colour="speed")
         if folder and comm.rank == 0:
             from dolfinx_nts.output.plots import compare_balances
 

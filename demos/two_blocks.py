@@ -150,7 +150,7 @@ def main(
         results[name], tables[name] = figures(run), run.balance
         if output:
             run.plot(folder / "balance.png")
-            picture(system.bodies, folder / "speed.png", colour="speed")
+            picture(run, folder / "speed.png", colour="speed")
     if output and comm.rank == 0:
         compare_balances(tables, Path(output) / "two_blocks.png")
     if comm.rank == 0:

@@ -97,7 +97,7 @@ class Pictures:
             return
         self.next = self.interval * (1 + round(t / self.interval))
         path = self.folder / f"tori_{t:.2f}.png"
-        picture(stepper.system.bodies, path, title=f"t = {t:.2f}", view=(12, -75), limits=(0, 60))
+        picture(stepper, path, title=f"t = {t:.2f}", view=(12, -75), limits=(0, 60))
 
     def close(self, stepper):
         """Nothing is open."""

@@ -256,8 +256,7 @@ def main(
     )  # fmt: skip
     r = figures(run, path, facets) | {"seconds": time.perf_counter() - clock}
     if folder:
-        drawn = [body for body in system.bodies if body.mesh is not None]
-        picture(drawn, folder / "wheel.png", view=(10.0, -80.0))
+        picture(run, folder / "wheel.png", view=(10.0, -80.0))
     if comm.rank == 0:
         report(r, facets)
         if folder:

@@ -47,7 +47,8 @@ SHORT: dict[str, str] = {
 #: Modules that users import themselves, by the page they are on.
 MORE = {
     "output": [
-        f"dolfinx_nts.output.{name}" for name in ("fields", "tables", "film", "pictures", "plots")
+        f"dolfinx_nts.output.{name}"
+        for name in ("fields", "tables", "film", "pictures", "interactive", "plots")
     ],
     "study": [
         f"dolfinx_nts.study.{name}"

@@ -47,6 +47,7 @@ from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.measures import HoldingLaw, Law, Move, Row
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.sketch import Sketch
 from dolfinx_nts.joints import (
     Cylindrical,
     Distance,
@@ -151,6 +152,7 @@ __all__ = [
     "SelfContact",
     "Section",
     "Shell",
+    "Sketch",
     "Slopes",
     "Solution",
     "Sphere",

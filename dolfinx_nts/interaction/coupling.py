@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import Kinematics
+from dolfinx_nts.interaction.sketch import Sketch
 from dolfinx_nts.state import State
 from dolfinx_nts.types import FloatArray, IntArray, Settings
 
@@ -109,6 +110,14 @@ class Joint:
         for all of them, of a joint that holds.
         """
         return None
+
+    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+        """What pictures show of it. Collective.
+
+        Args:
+            u: Owned displacements of each of its bodies [m].
+        """
+        return Sketch()
 
     def coupling(self, bodies: tuple[int, ...]) -> JointCoupling:
         """Return what makes its elements in a run.

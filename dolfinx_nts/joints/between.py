@@ -17,6 +17,7 @@ from dolfinx_nts.interaction.constraint_elements import Equations
 from dolfinx_nts.interaction.constraint_rows import Arm, Upright
 from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
+from dolfinx_nts.interaction.sketch import Sketch
 from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.types import FloatArray
@@ -116,9 +117,11 @@ class Between(OfTwo, ABC):
         p_a: Its point of A, or of the ground; p_b alike.
         length: What makes a length of a product of two directions [m].
         motion: What is prescribed, see `drive`.
+        axes: Those that pictures show.
     """
 
     motion: Motion | None = None
+    axes: Sequence[Vector] = ()
 
     def __init__(
         self,
@@ -203,6 +206,14 @@ class Between(OfTwo, ABC):
         `products` that are zero at right angles do not tell directions from opposite ones.
         """
         return ()
+
+    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+        """Both points, the line between them, and the axes at the first. Collective."""
+        both = zip(self.sides, u, strict=True)
+        y = np.concatenate([side.reference + side.nodal(v) for side, v in both], axis=1)[0]
+        p, q, *axes = (v.weights @ y + v.constant for v in (self.p_a, self.p_b, *self.axes))
+        marked = np.array([(p, n) for n in axes]).reshape(-1, 2, 3)
+        return Sketch(np.array([[p, q]]), np.array([p, q]), marked)
 
     def arm(self) -> Vector | None:
         """A vector whose turn in a step is looked at, as no body need turn with it."""
@@ -310,14 +321,6 @@ def points_of(argument: str, body: Body, x: FloatArray) -> Any:
         return body.points(x)
     except ValueError as error:
         raise ValueError(f"{argument}: {error}") from error
-
-
-def triad(axis: FloatArray) -> FloatArray:
-    """Right-handed orthonormal m1, m2, n as rows, n along the axis."""
-    least = np.eye(3)[np.abs(axis).argmin()]
-    m1 = np.cross(least, axis)
-    m1 /= np.linalg.norm(m1)
-    return np.array([m1, np.cross(axis, m1), axis])
 
 
 class Motion:

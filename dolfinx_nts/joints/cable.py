@@ -12,6 +12,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.sketch import Sketch, moved
 from dolfinx_nts.joints.between import ROUNDED, Motion, points_of
 from dolfinx_nts.joints.cable_elements import CableCoupling, Memory
 from dolfinx_nts.kernels.cable import Lengths, Stretched
@@ -132,11 +133,14 @@ class Cable(Joint):
 
     def _measure(self, ends: Sequence[Body | None], places: FloatArray) -> Measure:
         """Vectors from each point to the next, of the nodes of all bodies."""
-        found = []
+        found: list[Any] = []
+        self._held: list[tuple[Points | None, FloatArray]] = [(None, x) for x in places]
         for body in self.bodies:
             mine = [k for k, end in enumerate(ends) if end is body]
             side = points_of(f"points of {self.name!r}", body, places[mine])
             found.append((mine, *_merged(side)))
+            for k, j in enumerate(mine):
+                self._held[j] = side.select([k]), places[j]
         count = sum(side.nodes.shape[1] for _, side, _ in found)
         weights, constants, first = np.zeros((len(ends), count)), places.copy(), 0
         for mine, side, own in found:
@@ -164,6 +168,11 @@ class Cable(Joint):
                 f"is {self._path!r} long; pass at least that, leave it out, or pass "
                 "axial_stiffness=, as an elastic cable may start with tension"
             )
+
+    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+        """Its path, straight also where it is slack, and its points. Collective."""
+        path = moved(self._held, self.bodies, u)
+        return Sketch(np.stack([path[:-1], path[1:]], axis=1), path)
 
     def length_at(self, time: float) -> float:
         """Its length without tension at a time [m]. Collective.

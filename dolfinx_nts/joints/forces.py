@@ -18,8 +18,10 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measured
 from dolfinx_nts.interaction.measures import Measure, Move, columns, holds
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.joints.between import OfTwo, points_of, require_directions, triad
+from dolfinx_nts.interaction.sketch import STRAIGHT, Shape, Sketch, along, moved
+from dolfinx_nts.joints.between import OfTwo, points_of, require_directions
 from dolfinx_nts.kernels import measures as kernel
+from dolfinx_nts.kernels.vectors import triad
 from dolfinx_nts.types import FloatArray, Vector, Vectors
 from dolfinx_nts.validation import StepFailedError, direction, require_same, vector
 
@@ -130,11 +132,14 @@ class BetweenPoints(AlongMeasure):
 
     Attributes:
         distance: Of the points in the reference [m], exactly 0 where they coincide.
+        shape: What pictures show of it.
 
     Raises:
         TypeError: An argument is of another kind.
         ValueError: An argument is out of range, or a point lies outside of a flexible body.
     """
+
+    shape: Shape = STRAIGHT
 
     def __init__(self, a: Any, b: Any, points: Vectors, *, name: str | None = None) -> None:
         ends = (a, b)
@@ -143,17 +148,25 @@ class BetweenPoints(AlongMeasure):
         given = _pair("points", points)
         self._given["points"] = [x.tolist() for x in given]
         held, constant = [], np.zeros(3)
+        self._ends: list[tuple[Any, FloatArray]] = []
         for sign, body, x in zip((1.0, -1.0), ends, given, strict=True):
             if body is None:
                 constant += sign * x
+                self._ends.append((None, x))
                 continue
             side = points_of(f"points of {self.name!r}", body, x)
+            self._ends.append((side, x))
             held.append((side, sign * side.weights[0]))
         weights = np.concatenate([w for _, w in held])
         self._lay(kernel.Length, [side for side, _ in held], [(weights, constant)])
         length = float(np.linalg.norm(given[0] - given[1]))
         rounded = length <= _ROUNDED * max(map(np.linalg.norm, given))
         self.distance = 0.0 if rounded else length
+
+    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+        """Its shape between the points. Collective."""
+        ends = moved(self._ends, self.bodies, u)
+        return Sketch(along(ends, self.shape, self.distance), ends)
 
     def _undirected(self, reason: str) -> ValueError:
         return ValueError(

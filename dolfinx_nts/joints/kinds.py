@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.joints.between import ROUNDED, Between, Product, Times, Vector, triad
+from dolfinx_nts.joints.between import ROUNDED, Between, Product, Times, Vector
 from dolfinx_nts.joints.laws import JointFriction, Motor, cone_limit, laws_on
+from dolfinx_nts.kernels.vectors import triad
 from dolfinx_nts.types import Places
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -96,6 +97,7 @@ class _WithAxis(Between):
         self.axis = direction(f"axis of {self.name!r}", axis)
         axes = triad(self.axis)
         (self.m1_a, self.m2_a, self.n_a), (self.m1_b, self.m2_b, self.n_b) = self.directions(axes)
+        self.axes = (self.n_a,)
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -334,7 +336,7 @@ class Universal(Between):
                 f"axes={axes!r} of {self.name!r}: are not at right angles; the arms of a cross are"
             )
         (self.n_a, _), (_, self.n_b) = self.directions(arms)
-        self.arms = arms
+        self.arms, self.axes = arms, (self.n_a, self.n_b)
 
     @cached_property
     def settings(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.interaction.sketch import COIL, DASHPOT
 from dolfinx_nts.joints.forces import AboutAxis, AlongMeasure, BetweenPoints, Stiff, Viscous
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import raise_together
@@ -107,6 +108,8 @@ class Spring(_Stores, BetweenPoints):
         UserFunctionError: energy or force raises.
     """
 
+    shape = COIL
+
     def __init__(
         self,
         a: Body | None,
@@ -155,6 +158,7 @@ class Damper(BetweenPoints):
 
     losses = ("damping_dissipation",)
     entry = ("damping_dissipation", 1.0)
+    shape = DASHPOT
 
     def __init__(
         self, a: Body | None, b: Body | None, points: Vectors, *, damping: float,

@@ -45,6 +45,14 @@ def relative_way(moved: FloatArray) -> FloatArray:
     return way
 
 
+def triad(axis: FloatArray) -> FloatArray:
+    """Right-handed orthonormal m1, m2, n as rows, n along the axis."""
+    least = np.eye(3)[np.abs(axis).argmin()]
+    m1 = np.cross(least, axis)
+    m1 /= np.linalg.norm(m1)
+    return np.array([m1, np.cross(axis, m1), axis])
+
+
 def solve_2x2(
     a: tuple[FloatArray, FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray]
 ) -> FloatArray:

@@ -10,16 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.ledger import contact_fields
-from dolfinx_nts.output.pictures import (
-    Drawn,
-    axes_of,
-    bounds,
-    check_picture,
-    colour_scale,
-    painted,
-    seen,
-)
+from dolfinx_nts.output.colours import Colour
+from dolfinx_nts.output.painting import Look, Painter
+from dolfinx_nts.output.pictures import check_look
 from dolfinx_nts.output.running import Cadence, Running
+from dolfinx_nts.output.seen import Given, Seen, seen
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.types import FloatArray
@@ -29,8 +24,8 @@ from dolfinx_nts.validation import StrPath, as_path, require_bool
 #: largest are left out.
 _LONGEST, _LEAST = 0.2, 0.02
 _COLOUR = "crimson"
-#: Frames per second.
-_PACE = 15.0
+#: Dots per inch, and frames per second.
+_DOTS, _PACE = 80, 15.0
 
 
 class _Frame(NamedTuple):
@@ -38,13 +33,13 @@ class _Frame(NamedTuple):
 
     Attributes:
         time: [s].
-        drawn: Facets of the bodies.
-        places: Of nodes with contact forces, right and up [m], shape (n, 2).
-        forces: There, right and up [N], shape (n, 2).
+        seen: Bodies, obstacles and joints.
+        places: Of nodes with contact forces [m], shape (n, 3).
+        forces: There [N], shape (n, 3).
     """
 
     time: float
-    drawn: list[Drawn]
+    seen: Seen
     places: FloatArray
     forces: FloatArray
 
@@ -52,9 +47,10 @@ class _Frame(NamedTuple):
 class Film:
     """Writes a GIF of a run, all frames of one size and one scale of colours.
 
+    What is in a frame is that of `pictures.picture` of a run; "pressure" is the mean of two steps.
     Arrows are contact forces on the nodes of slaves and masters, the longest that of the largest
     force in the film. In dynamics with a consistent mass the forces of single steps alternate. The
-    frames are kept on rank 0, 50 bytes for each corner of a facet, and drawn when the run ends, a
+    frames are kept on rank 0, 32 bytes for each corner of a facet, and drawn when the run ends, a
     second each; where it fails, the film ends there. A run that goes on from a checkpoint makes a
     film of what follows alone, so give it a path of its own.
 
@@ -67,10 +63,11 @@ class Film:
         colour: As of `pictures.picture`, as are the next ones.
         view: Elevation and azimuth of the viewer [degrees].
         limits: Ends of the colour scale; None: those of the film.
-        width: Of the bodies [inch], 80 dots per inch.
+        width: Of what is drawn [inch], 80 dots per inch.
+        units: As of `pictures.picture`.
 
     Raises:
-        ValueError: An argument is out of range; from `start`: no body has a mesh, or one no colour.
+        ValueError: An argument is out of range; from `start`: no body has a mesh, or the colour.
         OSError: On all ranks, as the run ends: the file cannot be written.
     """
 
@@ -81,10 +78,11 @@ class Film:
         every: int = 1,
         interval: float | None = None,
         forces: bool = True,
-        colour: str = "speed",
+        colour: Colour = "speed",
         view: tuple[float, float] = (22.0, -60.0),
         limits: tuple[float, float] | None = None,
         width: float = 5.0,
+        units: str = "m",
     ) -> None:
         self.path = as_path("path", path)
         if self.path.suffix.lower() != ".gif":
@@ -92,13 +90,12 @@ class Film:
         self._cadence = Cadence(every, interval)
         require_bool("forces", forces)
         self.forces = forces
-        self._look: tuple[Any, ...] = (colour, view, limits, width)
+        self._look: tuple[Any, ...] = (colour, view, limits, width, units)
         self._frames: list[_Frame] = []
 
     def start(self, stepper: Running) -> None:
         """Take the initial state."""
-        self._bodies = [b for b in stepper.system.bodies if b.mesh is not None]
-        check_picture(self._bodies, *self._look)
+        check_look(Given.of("system", stepper), *self._look)
         self._frames = []
         self._cadence.start(stepper)
         self._take(stepper)
@@ -117,33 +114,35 @@ class Film:
 
     def _take(self, stepper: Running) -> None:
         """Keep what is seen now. Collective."""
-        colour, view, _, _ = self._look
-        drawn, axes = seen(self._bodies, colour, view), axes_of(*view)[:2]
+        given = Given.of("system", stepper)
+        now = seen(given, self._look[0])
         found = [(np.empty((0, 3)), np.empty((0, 3)))]
-        for body in self._bodies if self.forces else ():
+        for body in given.bodies if self.forces else ():
             found += _loads(stepper, body)
         places, forces = (
-            gather_on_root(stepper.system.comm, np.concatenate(a)) @ axes.T
+            gather_on_root(stepper.system.comm, np.concatenate(a))
             for a in zip(*found, strict=True)
         )
-        self._frames.append(_Frame(stepper.state.time, drawn, places, forces))
+        self._frames.append(_Frame(stepper.state.time, now, places, forces))
 
     def _draw(self) -> None:
         """Paint all frames on one canvas size, and write them; rank 0 only."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         image = importlib.import_module("PIL.Image")  # matplotlib's own need
-        colour, view, limits, width = self._look
-        every = [d for frame in self._frames for d in frame.drawn]
-        scale, ends = colour_scale(every, colour, limits), bounds(every)
-        largest = max(np.linalg.norm(f.forces, axis=1).max(initial=0.0) for f in self._frames)
-        metres = _LONGEST * float(np.max(ends[1] - ends[0])) / largest if largest else 0.0
+        colour, view, limits, width, units = self._look
+        every = [frame.seen for frame in self._frames]
+        painter = Painter(every, colour, limits, Look(view, width, units, _DOTS))
+        flat = [frame.forces @ painter.turn[:, :2] for frame in self._frames]
+        largest = max(np.linalg.norm(f, axis=1).max(initial=0.0) for f in flat)
+        low, high = painter.ends
+        metres = _LONGEST * float((high - low).max()) / largest if largest else 0.0
         images = []
-        for frame in self._frames:
-            title = f"t = {frame.time:.4g} s"
-            figure = painted(frame.drawn, scale, ends, colour, view, width, title, False)
-            _arrows(figure.axes[0], frame, metres, _LEAST * largest)
-            figure.set_dpi(80)
+        for k, (frame, forces) in enumerate(zip(self._frames, flat, strict=True)):
+            figure = painter.figure(k, f"t = {frame.time:.4g} s")
+            places = frame.places @ painter.turn[:, :2]
+            _arrows(figure.axes[0], places, metres * forces, _LEAST * metres * largest)
+            figure.set_dpi(_DOTS)
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             images.append(image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
@@ -168,11 +167,11 @@ def _loads(stepper: Running, body: Any) -> Sequence[tuple[FloatArray, FloatArray
     return [(x[load.any(axis=1)], load[load.any(axis=1)]) for load in found]
 
 
-def _arrows(axes: Any, frame: _Frame, metres: float, least: float) -> None:
-    """Forces as arrows, `metres` [m/N] long."""
-    shown = np.linalg.norm(frame.forces, axis=1) > least
+def _arrows(axes: Any, places: FloatArray, ways: FloatArray, least: float) -> None:
+    """Forces as arrows, right and up [m], shape (n, 2), those longer than the least."""
+    shown = np.linalg.norm(ways, axis=1) > least
     if shown.any():
-        (x, y), (u, v) = frame.places[shown].T, metres * frame.forces[shown].T
+        (x, y), (u, v) = places[shown].T, ways[shown].T
         axes.quiver(
             x, y, u, v, angles="xy", scale_units="xy", scale=1.0, width=0.004, color=_COLOUR,
             zorder=5,

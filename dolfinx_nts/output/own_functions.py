@@ -74,7 +74,7 @@ def of_body(functions: Sequence[Own], body: Body, taken: Iterable[str]) -> list[
         if not isinstance(given, fem.Function):
             if body.law is None:
                 continue
-            function = _made(what, given, body)
+            function = made(what, given, body)
         if function.function_space.mesh.ufl_domain() == domain:
             found.append(_field(f"functions[{k}]", function, body))
             if function.name in names:
@@ -86,7 +86,7 @@ def of_body(functions: Sequence[Own], body: Body, taken: Iterable[str]) -> list[
     return found
 
 
-def _made(what: str, make: Callable[[Any], fem.Function], body: Body) -> Any:
+def made(what: str, make: Callable[[Any], fem.Function], body: Body) -> Any:
     """The Function that a callable makes of a body. Collective."""
     function: Any = make(body)
     wrong = not isinstance(function, fem.Function)

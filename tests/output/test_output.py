@@ -491,7 +491,7 @@ def test_bad_picture_options(options, message, mpi_tmp_path):
 
 
 def test_pictures_of_what_has_no_mesh(tmp_path):
-    with pytest.raises(ValueError, match=r"bodies=\(\).*at least one"):
+    with pytest.raises(ValueError, match=r"scene=\[\].*at least one"):
         pictures.picture([], tmp_path / "p.png")
-    with pytest.raises(TypeError, match=r"bodies\[0\]='ball': pass a sequence of Continuum bodies"):
+    with pytest.raises(TypeError, match=r"scene\[0\]='ball': pass a sequence of bodies"):
         pictures.picture(["ball"], tmp_path / "p.png")

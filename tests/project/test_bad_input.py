@@ -185,7 +185,7 @@ def test_what_is_no_number(name, action, bad):
         (r"^folder=None: pass a path, e.g.", lambda: Fields(None)),
         (r"^path=3: pass a path, e.g.", lambda: BalanceCSV(3)),
         (r"^path=3: pass a path, e.g.", lambda: nts.Solution(None).plot(3)),
-        (r"^bodies=3: pass a sequence of", lambda: picture(3, "p.png")),
+        (r"^scene=3: pass a sequence of", lambda: picture(3, "p.png")),
         (r"^colour=\[\]: choose one", lambda: picture([continuum()], "p.png", colour=[])),
         (r"^limits=\[\]: pass two", lambda: picture([continuum()], "p.png", limits=[])),
         (r"^mesh=None: pass a dolfinx mesh", lambda: nts.bodies_from_tags(None, None)),
@@ -504,7 +504,7 @@ def test_stress_of_a_rigid_body(tmp_path):
     rigid = nts.RigidBody(box(), density=1.0, name="hard")
     for stress in (nts.von_mises, nts.cauchy_stress):
         raises(TypeError, r"^body='hard': has no material W\(C\)", partial(stress, rigid))
-    pattern = r"^colour='stress': body 'hard' has no material; colour by 'speed', or leave it out"
+    pattern = r"^colour='stress': none of \['hard'\] has a material; colour by 'speed'"
     raises(ValueError, pattern, lambda: picture([rigid], tmp_path / "p.png", colour="stress"))
 
 
