@@ -24,6 +24,8 @@ FOLDERS = (
     "demos", "docs", "tests", "benchmarks", "meshes", "scripts", "dolfinx_nts", "debian",
     *(p.name for p in (ROOT / "dolfinx_nts").iterdir() if p.is_dir()),
 )  # fmt: skip
+#: What a sentence of a page may have of words, and an entry of the limits, a row of a table.
+SENTENCE, ENTRY = 35, 60
 
 
 def by_name(page):
@@ -41,6 +43,39 @@ def commands(page):
 def exists(name):
     """Whether there is such a file or folder, or one of such files if it has a star."""
     return any(list(root.glob(name.rstrip("/"))) for root in ROOTS)
+
+
+def prose(page):
+    """Paragraphs, items of lists and cells of tables; a span of code and a formula are a word."""
+    text = re.sub(r"^(```+).*?^\1$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"!\[[^\]]*\]\([^)]*\)|\$\$.*?\$\$", "", text, flags=re.DOTALL)
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    text = re.sub(r"`[^`]+`|\$[^$]+\$", "Code", text)
+    text = re.sub(r"^\s*(?:#.*|[-*] |\d+\. )", "\n\n", text, flags=re.MULTILINE)
+    text = re.sub(r"^\|(.*)\|$", lambda row: row[0].replace("|", "\n\n"), text, flags=re.MULTILINE)
+    return [part for part in text.split("\n\n") if not part.startswith("    ")]
+
+
+def words(text):
+    return len(re.findall(r"[^\W_][\w'./-]*", text))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_sentences_are_short(page):
+    if page.name == "CHANGELOG.md":
+        return
+    for part in prose(page):
+        for sentence in re.split(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*]*[A-Z0-9])", part):
+            assert words(sentence) <= SENTENCE, sentence
+
+
+def test_limits_are_few_and_short():
+    text = re.sub(r"`[^`]+`", "Code", (ROOT / "docs/limits.md").read_text())
+    entries = [r for r in re.findall(r"^\| (.*) \|$", text, re.MULTILINE) if "---" not in r]
+    entries = [entry for entry in entries if not entry.startswith("what you see")]
+    assert 0 < len(entries) <= 25
+    for entry in entries:
+        assert words(re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", entry)) <= ENTRY, entry
 
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
