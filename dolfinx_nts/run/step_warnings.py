@@ -23,6 +23,7 @@ from dolfinx_nts.solve.instability import releasing_motions
 from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.start.free_motion import free_motion
 from dolfinx_nts.start.massless_start import off_balance, thick_layer
+from dolfinx_nts.start.units import doubtful_units
 from dolfinx_nts.start.unresolved import tell_unresolved
 from dolfinx_nts.state import State
 from dolfinx_nts.system import cut_off
@@ -59,6 +60,7 @@ def tell_start(
         moved: How far the start was projected onto its joints, and a sentence.
     """
     system = problem.system
+    tell_units(solution, state.time)
     if moved is not None:
         solution.warn("start projected", state.time, *moved)
     doubt = incomplete(begun)
@@ -177,6 +179,12 @@ def tell_pieces(solution: Solution, time: float) -> None:
             "fragment the volumes in Gmsh, or make each a body",
             about=(name,),
         )  # fmt: skip
+
+
+def tell_units(solution: Solution, time: float) -> None:
+    """Warn of bodies whose numbers no one system of units explains. Collective."""
+    for name, size, text in doubtful_units(solution.system):
+        solution.warn("units", time, size, text, about=(name,))
 
 
 def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:

@@ -316,9 +316,9 @@ def waves(
     size = np.sqrt(12.0 * moments[0] / total)
     taken = float(global_sum(comm, np.array([mass[massless].sum()]))[0])
     axes, on = np.eye(3), massless[:, None]
-    pressed = sum(_stiffness(potential, np.outer(arm[:, k], axes[k])) for k in range(3))
-    sheared = sum(_stiffness(potential, np.outer(arm[:, k], axes[k - 1])) for k in range(3))
-    moved = sum(_stiffness(potential, size * on * axes[k]) for k in range(3)) / size**2
+    pressed = sum(stiffness_along(potential, np.outer(arm[:, k], axes[k])) for k in range(3))
+    sheared = sum(stiffness_along(potential, np.outer(arm[:, k], axes[k - 1])) for k in range(3))
+    moved = sum(stiffness_along(potential, size * on * axes[k]) for k in range(3)) / size**2
     of_all = global_sum(comm, np.array([pressed, sheared, moved]))
     pressed, sheared, moved = of_all / [3.0, 3.0, 1.0]
     # NaN of a body that resists no shear, or whose energy has no value at rest: nothing is told.
@@ -328,7 +328,7 @@ def waves(
     return float(thickness / size), float(speeds)
 
 
-def _stiffness(potential: Callable[[FloatArray], float], u: FloatArray) -> float:
+def stiffness_along(potential: Callable[[FloatArray], float], u: FloatArray) -> float:
     """Twice the quadratic part of the energy of a displacement on this rank."""
     u = _STRAIN * u
     rest = potential(np.zeros_like(u))
