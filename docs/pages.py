@@ -1,15 +1,16 @@
-"""What pages of the site are made of: the scripts in them, the demos and the reference.
+"""What pages of the site are made of: the scripts in them, notebooks, demos and the reference.
 
 `python docs/pages.py` (a part of `make docs`) runs every whole script of the pages and the demos,
-short, keeps what they write in docs/made/runs, and writes a page for each demo and for each folder
-of the package to docs/made. Runs whose sources have not changed are kept. With `--no-runs` it only
-writes pages, without the pictures that are not there.
+short, keeps what they write in docs/made/runs, and writes a page for each demo, each notebook and
+each folder of the package to docs/made, and a gallery. Runs whose sources have not changed are
+kept. With `--no-runs` it only writes pages, without the pictures that are not there.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import os
 import re
 import shlex
@@ -86,16 +87,33 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """README and all pages that a person wrote."""
-    written = (p for p in DOCS.rglob("*.md") if not {"made", "_build"} & set(p.parts))
+    """README, all pages that a person wrote, and notebooks."""
+    found = [*DOCS.rglob("*.md"), *DOCS.rglob("*.ipynb")]
+    written = (p for p in found if not {"made", "_build"} & set(p.parts))
     more = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]
     return [p for p in more if p.exists()] + sorted(written)
 
 
+def notebooks() -> list[Path]:
+    """All notebooks."""
+    return [page for page in pages() if page.suffix == ".ipynb"]
+
+
+def text_of(page: Path) -> str:
+    """What a page says in Markdown; of a notebook its cells, one after the other."""
+    if page.suffix != ".ipynb":
+        return page.read_text()
+    cells = [(c["cell_type"], "".join(c["source"])) for c in json.loads(page.read_text())["cells"]]
+    return "\n\n".join(f"```python\n{s}\n```" if kind == "code" else s for kind, s in cells) + "\n"
+
+
 def blocks() -> Iterator[Block]:
-    """All blocks of Python in all pages."""
+    """All blocks of Python in all pages; the cells of a notebook are one."""
     for page in pages():
-        text = page.read_text()
+        text = text_of(page)
+        if page.suffix == ".ipynb":
+            yield Block(page, 1, "\n\n".join(BLOCK.findall(text)))
+            continue
         for found in BLOCK.finditer(text):
             yield Block(page, text.count("\n", 0, found.start(1)) + 1, found[1])
 
@@ -188,6 +206,30 @@ def demo_page(demo: Path) -> str:
     ])  # fmt: skip
 
 
+def notebook_page(notebook: Path) -> str:
+    """The page of a notebook: its cells, each with the pictures that it names, and the file."""
+
+    def with_pictures(block: re.Match[str]) -> str:
+        names = re.findall(r'(?:picture|savefig)\([^)]*?"([\w.-]+\.png)"', block[0])
+        shown = [f"![{name}](runs/{notebook.stem}/{name})" for name in names]
+        return "\n\n".join([block[0], *shown])
+
+    title, _, rest = text_of(notebook).partition("\n")
+    file = f"{{download}}`{notebook.name} <../notebooks/{notebook.name}>`"
+    return f"{title}\n\nAs a notebook: {file}.\n{BLOCK.sub(with_pictures, rest)}"
+
+
+def gallery() -> str:
+    """A picture of each notebook and demo, if it is there, which leads to its page."""
+    kinds = [("notebook", p) for p in notebooks()] + [("demo", p) for p in demos()]
+    lines = ["# Gallery\n", "```{container} gallery"]
+    for kind, path in kinds:
+        pictures = sorted(drawn(MADE / "runs" / path.stem), key=lambda p: p.suffix != ".png")
+        shown = "".join(f"![{path.stem}]({p.relative_to(MADE)})\n" for p in pictures[:1])
+        lines.append(f"[{shown}{path.stem}]({kind}_{path.stem}.md)\n")
+    return "\n".join([*lines, "```\n"])
+
+
 def drawn(folder: Path) -> list[Path]:
     """Films and pictures of a run: films first, then those of the folder itself."""
     found = [p for p in folder.rglob("*.*") if p.suffix in (".gif", ".png")]
@@ -245,6 +287,9 @@ def main() -> None:
         write(MADE / name, text)
     for demo in demos():
         write(MADE / f"demo_{demo.stem}.md", demo_page(demo))
+    for notebook in notebooks():
+        write(MADE / f"notebook_{notebook.stem}.md", notebook_page(notebook))
+    write(MADE / "gallery.md", gallery())
 
 
 def write(path: Path, text: str) -> None:

@@ -113,7 +113,7 @@ class LoadStepper(Stepper):
         self._materials.changed()
         self._ledger.open(self.state, self._start)
         step_warnings.tell_cut_off(self.solution, self.state)
-        step_warnings.tell_units(self.solution, self.state.time)
+        step_warnings.tell_units(self.solution, self.state.time, in_time=False)
         self._started = True
 
     def _step(self, dt: float, time: float) -> None:

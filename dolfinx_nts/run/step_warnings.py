@@ -60,7 +60,7 @@ def tell_start(
         moved: How far the start was projected onto its joints, and a sentence.
     """
     system = problem.system
-    tell_units(solution, state.time)
+    tell_units(solution, state.time, in_time=True)
     if moved is not None:
         solution.warn("start projected", state.time, *moved)
     doubt = incomplete(begun)
@@ -181,9 +181,9 @@ def tell_pieces(solution: Solution, time: float) -> None:
         )  # fmt: skip
 
 
-def tell_units(solution: Solution, time: float) -> None:
+def tell_units(solution: Solution, time: float, *, in_time: bool) -> None:
     """Warn of bodies whose numbers no one system of units explains. Collective."""
-    for name, size, text in doubtful_units(solution.system):
+    for name, size, text in doubtful_units(solution.system, in_time=in_time):
         solution.warn("units", time, size, text, about=(name,))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.solid.mass import stiffness_along
-from dolfinx_nts.parallel import global_max, global_sum
+from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.system import System
 
 #: Units that scenes are written in: length [m] and time [s]. That of mass drops out of a speed.
@@ -30,11 +30,15 @@ _CRUSHED = 10.0
 _REMEDY = "check that modulus, density, lengths and gravity are in one system of units"
 
 
-def doubtful_units(system: System) -> Iterator[tuple[str, float, str]]:
+def doubtful_units(system: System, *, in_time: bool) -> Iterator[tuple[str, float, str]]:
     """Bodies that gravity would crush, or of a wave speed that no material has. Collective.
 
     The first is a ratio without units. The second needs the units of length and time, which
     gravity tells if it is that of the Earth; without gravity nothing is known.
+
+    Args:
+        system: The scene.
+        in_time: Whether mass counts: in statics next to no density means no weight.
 
     Yields:
         Name of a body, by which factor it is out of range, and a sentence with a remedy.
@@ -49,14 +53,17 @@ def doubtful_units(system: System) -> Iterator[tuple[str, float, str]]:
         (np.nan, ""),
     )
     for body in system.bodies:
-        speed = 0.0 if body.rigid or body.mesh is None or not gravity else _wave_speed(body)
+        free = anywhere(body.comm, len(body.fixed) < body.num_owned)
+        if not (gravity and free) or body.rigid or body.mesh is None:
+            continue
+        speed = _wave_speed(body)
         if not speed > 0.0:
             continue
         heights = body.reference.reshape(-1, 3)[body.places] @ (system.gravity / gravity)
         ends = np.array([heights.max(initial=-np.inf), (-heights).max(initial=-np.inf)])
         crushed = gravity * float(global_max(body.comm, ends).sum()) / speed**2 / _CRUSHED
         off, beside = max(
-            (speed * unit / _FASTEST, "more"), (_SLOWEST / (speed * unit), "less")
+            (in_time * speed * unit / _FASTEST, "more"), (_SLOWEST / (speed * unit), "less")
         )
         if off > 1.0:
             yield body.name, off, (

@@ -5,6 +5,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import json
 import re
 import shlex
 
@@ -34,7 +35,7 @@ def by_name(page):
 
 def commands(page):
     """What a page says in code: spans, and lines of blocks that are not Python."""
-    text = pages.BLOCK.sub("", page.read_text())
+    text = pages.BLOCK.sub("", pages.text_of(page))
     lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
     fences = re.findall(r"^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     return [*CODE.findall(text), *lines, *"".join(fences).splitlines()]
@@ -47,7 +48,7 @@ def exists(name):
 
 def prose(page):
     """Paragraphs, items of lists and cells of tables; a span of code and a formula are a word."""
-    text = re.sub(r"^(```+).*?^\1$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^(```+).*?^\1$", "", pages.text_of(page), flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r"!\[[^\]]*\]\([^)]*\)|\$\$.*?\$\$", "", text, flags=re.DOTALL)
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
     text = re.sub(r"`[^`]+`|\$[^$]+\$", "Code", text)
@@ -80,7 +81,7 @@ def test_limits_are_few_and_short():
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_links_lead_somewhere(page):
-    for target in LINK.findall(page.read_text()):
+    for target in LINK.findall(pages.text_of(page)):
         path = target.partition("#")[0]
         if path and "://" not in path and "made/" not in path:
             assert (page.parent / path).exists(), target
@@ -141,9 +142,9 @@ def check_tests(command):
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_names_of_the_package_exist(page):
-    for name in re.findall(r"\bnts\.(\w+)", page.read_text()):
+    for name in re.findall(r"\bnts\.(\w+)", pages.text_of(page)):
         assert hasattr(nts, name), name
-    for name in re.findall(r"`dolfinx_nts\.([\w.]+)`", page.read_text()):
+    for name in re.findall(r"`dolfinx_nts\.([\w.]+)`", pages.text_of(page)):
         module, _, attribute = f"dolfinx_nts.{name}".rpartition(".")
         whole = importlib.util.find_spec(module) and importlib.import_module(module)
         assert hasattr(whole, attribute) or importlib.util.find_spec(f"{module}.{attribute}"), name
@@ -173,6 +174,15 @@ def test_every_docstring_section_of_theory_is_there():
     for path in (ROOT / "dolfinx_nts").rglob("*.py"):
         for number in re.findall(r"theory (?:section )?(\d+)", path.read_text()):
             assert int(number) in sections, path
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.suffix == ".ipynb"], ids=by_name)
+def test_notebooks_are_without_output(page):
+    """What a run has left in them would grow old, and change with each run."""
+    notebook = json.loads(page.read_text())
+    assert (notebook["nbformat"], notebook["metadata"]["language_info"]) == (4, {"name": "python"})
+    for cell in notebook["cells"]:
+        assert not cell.get("outputs") and not cell.get("execution_count")
 
 
 @pytest.mark.slow
