@@ -54,7 +54,7 @@ def prose(page):
     text = re.sub(r"`[^`]+`|\$[^$]+\$", "Code", text)
     text = re.sub(r"^\s*(?:#.*|[-*] |\d+\. )", "\n\n", text, flags=re.MULTILINE)
     text = re.sub(r"^\|(.*)\|$", lambda row: row[0].replace("|", "\n\n"), text, flags=re.MULTILINE)
-    return [part for part in text.split("\n\n") if not part.startswith("    ")]
+    return [part for part in text.split("\n\n") if not part.lstrip("\n").startswith("    ")]
 
 
 def words(text):
@@ -166,6 +166,23 @@ def test_calls_have_these_arguments(block):
             known = inspect.signature(function).parameters
         for word in node.keywords:
             assert word.arg is None or word.arg in known, f"{called.attr}({word.arg}=)"
+
+
+TABLES = re.compile(r"^\| `nts\.([\w.]+)` \| unit \| default .*\n\|[-|]+\n((?:\|.*\n)+)", re.M)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if TABLES.search(pages.text_of(p))], ids=by_name)
+def test_tables_of_parameters_have_the_defaults_of_signatures(page):
+    for name, rows in TABLES.findall(pages.text_of(page)):
+        found = functools.reduce(getattr, name.split("."), nts)
+        taken = inspect.signature(found.__init__ if isinstance(found, type) else found).parameters
+        for row in rows.splitlines():
+            argument, _, told, *_ = (cell.strip() for cell in row.strip("|").split(" | "))
+            default = taken[argument.strip("`")].default
+            if told == "required":
+                assert default is inspect.Parameter.empty, f"{name}: {row}"
+            else:
+                assert ast.literal_eval(told.strip("`")) == default, f"{name}: {row}"
 
 
 def test_every_docstring_section_of_theory_is_there():
