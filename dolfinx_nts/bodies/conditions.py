@@ -55,7 +55,7 @@ class Dirichlet:
 
     Attributes:
         where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag). Nodes inside a
-            Continuum or FormBody at which the function is true stay free, which is told.
+            Continuum or FormBody at which the function is true stay free; a warning says so.
         value: Displacement [m], whose work is external work; the nodes start where and as fast as
             it says at the start. It is
             - a vector, or a function of time t -> (3,), the same for all nodes;

@@ -48,7 +48,7 @@ class MeshBody(Body):
 
         - It is not smooth at edges whose facets meet at more than 60 degrees, at nodes where other
           than four quadrilaterals meet, and at nodes whose triangles see no common plane, such as
-          corners where three sharp edges meet on a flat side. A warning tells how many facets.
+          corners where three sharp edges meet on a flat side. A warning says how many facets.
         - It bulges beyond the facets by what they cut off the curve, an eighth of the angle between
           neighbours times the size of a facet: gaps are measured from there.
         - Beyond its facet a patch goes on as a polynomial, which is good for half a facet; let no
@@ -65,7 +65,7 @@ class MeshBody(Body):
         have it, of a Continuum with some four cells behind the surface, with `EnergyMomentum()` or
         `Midpoint()` and without restored impacts. `equilibrium` refuses it: a run begins from that
         of a body of the same mesh and name without it. Gravity then moves with the mass, so that
-        what rests under its weight starts as far off balance, which the run tells.
+        what rests under its weight starts as far off balance, and the run warns of it.
 
         Args:
             marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet

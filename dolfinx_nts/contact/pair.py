@@ -120,7 +120,7 @@ class ContactPair:
             to the pseudo time, until none is left at 1; the work of that is `interference_work` in
             the balance. `simulate` starts from its result. Equilibrium presses out any overlap in
             this way, also the small one that "refuse" allows. "resolve" presses sharp edges that
-            start inside each other out, too, in the first load steps; "refuse" tells them.
+            start inside each other out, too, in the first load steps; "refuse" warns of them.
         adjust: Slave nodes whose gap at the start is at most this, outside or inside, touch then
             without strain or force, as if they stood on the master: what the nodes of two meshes
             miss each other by. The gap that they start with goes on being none; bodies are drawn

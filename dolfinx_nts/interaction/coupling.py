@@ -246,5 +246,5 @@ class JointCoupling(Coupling, Protocol):
 
         Args:
             state: The state; without accelerations they count as zero.
-            dt: Time in which prescribed values are told [s].
+            dt: Time over which prescribed values are differentiated [s].
         """

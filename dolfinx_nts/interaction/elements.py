@@ -30,7 +30,7 @@ def over(value: float, limit: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a step tells those who make its elements.
+    """What those who make a step's elements know of the step.
 
     Attributes:
         state: At t_n.

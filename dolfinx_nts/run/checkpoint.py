@@ -170,9 +170,10 @@ def restart(path: StrPath, system: System) -> Restart:
     each checkpoint.) Its balance, warnings and changes of facet go on, and so do equal steps and
     those of `Adapt`. A longer `t_end`, another `dt`, another integrator are legal: it goes on from
     the state then. Obstacles at another place or of another size are refused with their numbers.
-    Materials that give the bodies another energy are told, "material changed", with what they add;
-    so are constant loads and supports with other values, "loads changed". What is a function is not
-    in the file and must be the same: loads and supports in time, motion of bodies and obstacles.
+    Materials that give the bodies another energy cause the warning "material changed" with what
+    they add, constant loads and supports with other values the warning "loads changed". Functions
+    are not in the file and must be the same: loads and supports in time, motion of bodies and
+    obstacles.
     `contact_fields` are zero until the first step.
 
     `BalanceCSV` and `ForcesCSV` write the whole table anew; `Fields` goes on with the files in its

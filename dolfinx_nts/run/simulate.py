@@ -135,8 +135,9 @@ def simulate(
             "material_change" in the balance.
 
         project_start: Start with the nearest velocities, in the kinetic energy, that the joints
-            allow; else a start that violates a joint is refused with its name, but for what meshes
-            do to it, a thousandth of its bodies' speed, which is projected and told.
+            allow. Else a start that violates a joint is refused with its name; one that violates it
+            by less than a thousandth of its bodies' speed, as meshes may, is projected with a
+            warning.
         ledger: Keep energies, momenta, works and counts in the balance; without it they are NaN
             after the start, and nothing watches over energy and momentum. It costs a few parts in a
             hundred of small scenes' steps.
@@ -151,7 +152,7 @@ def simulate(
         restitution: Of "restored", between 0 (plastic) and 1: root of the part of the energy above
             that of a plastic impact that is left.
         checkpoint: Write what `restart` needs to go on with the run; see `Checkpoint`. One that
-            cannot be written is told in the warnings, and the run goes on.
+            cannot be written causes a warning, and the run goes on.
 
     Returns:
         The Solution. SIGINT (Ctrl-C) and SIGTERM on any rank end the run after the step that is

@@ -29,4 +29,4 @@ class Writer(Protocol):
         """
 
     def close(self, stepper: Stepper) -> Any:
-        """Called once at the end, also of a run that failed: `stepper.solution.status` tells."""
+        """Called once at the end, also of a run that failed: see `stepper.solution.status`."""

@@ -77,7 +77,8 @@ class Continuum(UflBody):
         body_force: Force per reference volume [N/m^3], a vector or a function of time.
         traction: `Traction` loads.
         quadrature_degree: For energy, stress and loads; default 2 x 2 x 2 Gauss points on trilinear
-            hexahedra. Mass has never less than that: with one point a cell could turn for nothing.
+            hexahedra. Mass has never less than that: with one point a cell could turn without
+            inertia.
         extra_form: Further virtual work as UFL, a callable (u, v, w, t) -> form of displacement,
             velocity and time where the integrator takes forces (the middle of the step; in statics
             its end, at rest) and of the test function w; it is added to the internal virtual work
