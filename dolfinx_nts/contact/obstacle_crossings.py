@@ -280,8 +280,8 @@ class ObstacleContact:
         if not (deep.facet.size and np.isfinite(self.contact.master.width)):
             return []
         remedy = (
-            "it starts there, no contact is declared of it, and it is not looked at: if the "
-            "obstacle is no longer than what it stands for, move the two apart"
+            "it starts there without a declared contact, so it is not looked at: unless the "
+            "obstacle is longer than the thing that it stands for, move the two apart"
         )
         told = self._told(surface, deep, _worst(deep), np.zeros(3), remedy)
         return [told._replace(kind="facet starts in an obstacle", grave=False)]

@@ -148,9 +148,9 @@ def inside_rim(
     text = (
         f"facets of {one!r} reach over the rim of {two!r}, and all of contact {contact.name!r} "
         f"acts at their nodes before it, most at node {node}, inside the rim by "
-        f"{found.distance:.3g}, or {found.size:.2g} of the surface's width: what tips there does "
-        f"so about these nodes, not about the rim; use a finer mesh of {one!r} there, or take "
-        f"{two!r} as the slave"
+        f"{found.distance:.3g}, or {found.size:.2g} of the surface's width: a body that tips "
+        f"there turns about these nodes, not about the rim; use a finer mesh of {one!r} there, or "
+        f"take {two!r} as the slave"
     )
     place, grave = x[found.node] + contact.origin, found.size > _GRAVE
     return Finding(

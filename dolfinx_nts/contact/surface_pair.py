@@ -109,8 +109,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
             )
         if self.adjust:
             raise ValueError(
-                f'adjust={self.adjust!r}: what nodes miss their facets by is nothing that '
-                'integration="surface" takes its gaps at; leave one of them out'
+                f'adjust={self.adjust!r}: closes the gaps of nodes, and integration="surface" '
+                "takes its gaps at points between them; leave one of them out"
             )
         if self.master.smooth:
             raise ValueError(

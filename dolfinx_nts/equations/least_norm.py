@@ -171,8 +171,8 @@ class NullSpace:
             if reason == _LIMIT and self._comm.rank == 0:
                 logger.warning(
                     "forces of joints that repeat each other: those of least norm are not found in "
-                    "%d iterations; what is given moves the bodies alike, but may hold a part that "
-                    "does nothing: drop a joint of the loop", most,
+                    "%d iterations; those given move the bodies in the same way, but may have a "
+                    "part that cancels out: drop a joint of the loop", most,
                 )  # fmt: skip
             found = found - self._matrix @ least
         return found

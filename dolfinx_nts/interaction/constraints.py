@@ -279,8 +279,8 @@ class Constraints(EveryStep):
         return [
             StepWarning(
                 "turns", float(turns[k]),
-                f"joint {self._names[k]!r} turns by {turns[k]:.2g} rad in a step, too far for how "
-                "it turns to be right, though energy and momenta may be kept; use a smaller dt",
+                f"joint {self._names[k]!r} turns by {turns[k]:.2g} rad in a step, too far for "
+                "the angle to be right, though energy and momenta may be kept; use a smaller dt",
                 (self._names[k],), False,
             )
             for k in np.flatnonzero(turns > FAR_TURN)

@@ -169,7 +169,7 @@ class Seam(Joint):
             x = held.reference[sine.argmin(), 0].tolist()
             raise ValueError(
                 f"edge: meets shell {shell.name!r} at {np.rad2deg(np.arcsin(sine.min())):.3g} "
-                f"degrees at x={x}, where 20 or more tell how directors turn; make one mesh of both"
+                f"degrees at x={x}, and a seam needs 20 or more; make one mesh of both"
             )
         self._sides: tuple[Points, ...] = (at.select(mine), held.select(mine))
         self._scale, self._product = np.sqrt(lengths), product[mine]

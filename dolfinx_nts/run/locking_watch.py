@@ -86,8 +86,8 @@ class LockingWatch:
                 solution.warn(
                     "locking", time, share,
                     f"cells of body {body.name!r} may be too stiff for its motion: {share:.2g} of "
-                    f"its squared stress jumps from cell to cell, and more than {_LOCKED} tells "
-                    f"of errors of several per cent; {body.remedy_of_locking}",
+                    f"its squared stress is in jumps from cell to cell, and more than {_LOCKED} "
+                    f"means errors of several per cent; {body.remedy_of_locking}",
                     about=(body.name,),
                 )  # fmt: skip
             elif body.is_thin:

@@ -213,8 +213,8 @@ def incomplete(start: Solution | None) -> str | None:
     last = start.settings["load_steps"][-1]
     return (
         f"start: the equilibrium that it begins from is not complete: it ended at "
-        f"t={start.state.time:.6g} of {last:.6g} ({start.status}), so loads and supports may act "
-        "at once that it had not reached; let it complete, e.g. with equilibrium(..., start=it), "
+        f"t={start.state.time:.6g} of {last:.6g} ({start.status}), so loads and supports that it "
+        "had not reached may act at once; let it complete, e.g. with equilibrium(..., start=it), "
         "more load_steps or stabilization=0.1, and begin from that one"
     )
 

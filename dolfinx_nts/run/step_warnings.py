@@ -242,7 +242,7 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
         prescribed = driven[worst] > FAR_TURN
         solution.warn(
             "turns", new.time, turn,
-            f"body {name!r} turns {by} {turn:.2g} rad in a step, too far for how it turns to be "
+            f"body {name!r} turns {by} {turn:.2g} rad in a step, too far for the angle to be "
             f"right, though {'its places' if prescribed else 'energy and momenta'} may be "
             f"{'as prescribed' if prescribed else 'kept'}; use a smaller dt",
             grave=bool(prescribed),

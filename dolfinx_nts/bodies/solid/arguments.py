@@ -53,6 +53,6 @@ def check_cells(
         )
     if bending and viscous:
         raise ValueError(
-            f"bending={bending!r} of {name!r}: is for bodies without viscosity, which would take "
-            "from cells that bend what the shear of their corners takes; use degree=2"
+            f"bending={bending!r} of {name!r}: is for bodies without viscosity, which would damp "
+            "cells that bend by the shear of their corners; use degree=2"
         )

@@ -103,15 +103,15 @@ class BendingModes:
         if distortion > _DISTORTED:
             text = (
                 f"cells of body {name!r} are too far from parallelepipeds for bending=True, by "
-                f"{distortion:.2g}, of which {_DISTORTED} costs several per cent and 1 most of it: "
-                "it may be too stiff; use more cells along curves, regular ones, or degree=2"
+                f"{distortion:.2g}: {_DISTORTED} makes them several per cent too stiff, and 1 "
+                "undoes most of it; use more cells along curves, regular ones, or degree=2"
             )
             found.append(StepWarning("distorted cells", distortion, text, (name,)))
         if least < _FOLDS:
             text = (
                 f"a cell of body {name!r} is compressed to {max(least, 0.0) ** 0.5:.2g} of a "
-                "length, where bending=True lets it fold for nothing; leave bending out, or pass "
-                "degree=2"
+                "length, where bending=True lets it fold without a force; leave bending out, or "
+                "pass degree=2"
             )
             found.append(StepWarning("folding cells", _FOLDS - least, text, (name,)))
         return found
