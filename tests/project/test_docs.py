@@ -29,10 +29,6 @@ FOLDERS = (
 SENTENCE, ENTRY = 35, 60
 
 
-def by_name(page):
-    return str(page.relative_to(ROOT))
-
-
 def commands(page):
     """What a page says in code: spans, and lines of blocks that are not Python."""
     text = pages.BLOCK.sub("", pages.text_of(page))
@@ -61,13 +57,13 @@ def words(text):
     return len(re.findall(r"[^\W_][\w'./-]*", text))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
-def test_sentences_are_short(page):
-    if page.name == "CHANGELOG.md":
-        return
-    for part in prose(page):
-        for sentence in re.split(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*]*[A-Z0-9])", part):
-            assert words(sentence) <= SENTENCE, sentence
+def test_sentences_are_short():
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":
+            continue
+        for part in prose(page):
+            for sentence in re.split(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*]*[A-Z0-9])", part):
+                assert words(sentence) <= SENTENCE, sentence
 
 
 def test_limits_are_few_and_short():
@@ -79,33 +75,33 @@ def test_limits_are_few_and_short():
         assert words(re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", entry)) <= ENTRY, entry
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
-def test_links_lead_somewhere(page):
-    for target in LINK.findall(pages.text_of(page)):
-        path = target.partition("#")[0]
-        if path and "://" not in path and "made/" not in path:
-            assert (page.parent / path).exists(), target
+def test_links_lead_somewhere():
+    for page in PAGES:
+        for target in LINK.findall(pages.text_of(page)):
+            path = target.partition("#")[0]
+            if path and "://" not in path and "made/" not in path:
+                assert (page.parent / path).exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
-def test_files_exist(page):
+def test_files_exist():
     mentioned = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS)})/[\w./*-]*[\w*/]")
-    for name in mentioned.findall("\n".join(commands(page))):
-        assert "_build" in name or exists(name), name
+    for page in PAGES:
+        for name in mentioned.findall("\n".join(commands(page))):
+            assert "_build" in name or exists(name), name
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
-def test_commands_exist(page):
+def test_commands_exist():
     targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    for command in commands(page):
-        for target in re.findall(r"^make ([a-z][\w-]*)", command):
-            assert target in targets, command
-        for module in re.findall(r"python -m (dolfinx_nts[\w.]*)", command):
-            assert importlib.util.find_spec(module), command
-        for name in re.findall(r"(?:^|\s)((?:demos|benchmarks)/\w+\.py)", command):
-            check_options(ROOT / name, command)
-        if re.match(r"(\S*python -m )?pytest", command):
-            check_tests(command)
+    for page in PAGES:
+        for command in commands(page):
+            for target in re.findall(r"^make ([a-z][\w-]*)", command):
+                assert target in targets, command
+            for module in re.findall(r"python -m (dolfinx_nts[\w.]*)", command):
+                assert importlib.util.find_spec(module), command
+            for name in re.findall(r"(?:^|\s)((?:demos|benchmarks)/\w+\.py)", command):
+                check_options(ROOT / name, command)
+            if re.match(r"(\S*python -m )?pytest", command):
+                check_tests(command)
 
 
 def check_options(script, command):
@@ -116,9 +112,9 @@ def check_options(script, command):
         assert f'"{option}"' in text, f"{option} of {script.name}"
 
 
-@pytest.mark.parametrize("demo", pages.SHORT)
-def test_short_runs_have_options_of_their_demos(demo):
-    check_options(ROOT / "demos" / f"{demo}.py", f"{demo}.py {pages.SHORT[demo]}")
+def test_short_runs_have_options_of_their_demos():
+    for demo, options in pages.SHORT.items():
+        check_options(ROOT / "demos" / f"{demo}.py", f"{demo}.py {options}")
 
 
 @functools.cache
@@ -140,20 +136,20 @@ def check_tests(command):
         assert found, f"{word!r} of {command}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
-def test_names_of_the_package_exist(page):
-    for name in re.findall(r"\bnts\.(\w+)", pages.text_of(page)):
-        assert hasattr(nts, name), name
-    for name in re.findall(r"`dolfinx_nts\.([\w.]+)`", pages.text_of(page)):
-        module, _, attribute = f"dolfinx_nts.{name}".rpartition(".")
-        whole = importlib.util.find_spec(module) and importlib.import_module(module)
-        assert hasattr(whole, attribute) or importlib.util.find_spec(f"{module}.{attribute}"), name
+def test_names_of_the_package_exist():
+    for page in PAGES:
+        for name in re.findall(r"\bnts\.(\w+)", pages.text_of(page)):
+            assert hasattr(nts, name), name
+        for name in re.findall(r"`dolfinx_nts\.([\w.]+)`", pages.text_of(page)):
+            module, _, attribute = f"dolfinx_nts.{name}".rpartition(".")
+            whole = importlib.util.find_spec(module) and importlib.import_module(module)
+            found = hasattr(whole, attribute) or importlib.util.find_spec(f"{module}.{attribute}")
+            assert found, name
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=lambda b: b.name)
-def test_calls_have_these_arguments(block):
+def test_calls_have_these_arguments():
     """Also of blocks that are no whole scripts."""
-    for node in ast.walk(ast.parse(block.code)):
+    for node in (node for block in BLOCKS for node in ast.walk(ast.parse(block.code))):
         called = node.func if isinstance(node, ast.Call) else None
         of_package = isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name)
         if not (of_package and called.value.id == "nts"):
@@ -171,9 +167,10 @@ def test_calls_have_these_arguments(block):
 TABLES = re.compile(r"^\| `nts\.([\w.]+)` \| unit \| default .*\n\|[-|]+\n((?:\|.*\n)+)", re.M)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if TABLES.search(pages.text_of(p))], ids=by_name)
-def test_tables_of_parameters_have_the_defaults_of_signatures(page):
-    for name, rows in TABLES.findall(pages.text_of(page)):
+def test_tables_of_parameters_have_the_defaults_of_signatures():
+    tables = [found for page in PAGES for found in TABLES.findall(pages.text_of(page))]
+    assert tables
+    for name, rows in tables:
         found = functools.reduce(getattr, name.split("."), nts)
         taken = inspect.signature(found.__init__ if isinstance(found, type) else found).parameters
         for row in rows.splitlines():
@@ -182,7 +179,7 @@ def test_tables_of_parameters_have_the_defaults_of_signatures(page):
             if told == "required":
                 assert default is inspect.Parameter.empty, f"{name}: {row}"
             else:
-                assert ast.literal_eval(told.strip("`")) == default, f"{name}: {row}"
+                assert ast.literal_eval(told) == default, f"{name}: {row}"
 
 
 def test_every_docstring_section_of_theory_is_there():
@@ -193,13 +190,13 @@ def test_every_docstring_section_of_theory_is_there():
             assert int(number) in sections, path
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if p.suffix == ".ipynb"], ids=by_name)
-def test_notebooks_are_without_output(page):
+def test_notebooks_are_without_output():
     """What a run has left in them would grow old, and change with each run."""
-    notebook = json.loads(page.read_text())
-    assert (notebook["nbformat"], notebook["metadata"]["language_info"]) == (4, {"name": "python"})
-    for cell in notebook["cells"]:
-        assert not cell.get("outputs") and not cell.get("execution_count")
+    for page in pages.notebooks():
+        notebook = json.loads(page.read_text())
+        assert notebook["nbformat"] == 4
+        for cell in notebook["cells"]:
+            assert not cell.get("outputs") and not cell.get("execution_count")
 
 
 @pytest.mark.slow
