@@ -229,7 +229,7 @@ class ContactElements(Batch):
         middle = start + self.measure.num_augmented
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
 
-    def _law_rows(self, k: Contribution) -> FloatArray:
+    def law_rows(self, k: Contribution) -> FloatArray:
         """What is left of the constraints of each slave [kg m], shape (n, constraints)."""
         return of_multipliers(self, self.rows(k, "constraints")).reshape(k.multiplier.shape)
 
@@ -284,7 +284,7 @@ class ContactElements(Batch):
     # ---- what a step asks of elements once it is solved, or is not
     def largest(self, part: Contribution) -> list[float]:
         """Sizes that `ratios` compares: augmented rows, gaps, multipliers and scale."""
-        gaps = self._law_rows(part) / self.law.scale[:, None]
+        gaps = self.law_rows(part) / self.law.scale[:, None]
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.law.scale)
         found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
         # Rows of gaps that repeat each other miss what no motion closes, see `shared_weight`.
@@ -411,7 +411,7 @@ class ContactElements(Batch):
             part: Last iterate.
             flips: How often `Contribution.status` changed, shape (2, n).
         """
-        rows = np.abs(self._law_rows(part)).max(axis=1)
+        rows = np.abs(self.law_rows(part)).max(axis=1)
         weight = np.where(np.isnan(rows), np.inf, rows) * (1 + flips.sum(axis=0))
         i = int(np.argmax(weight))
         touch, slide = (int(n) for n in flips[:, i])

@@ -150,6 +150,9 @@ class ContactLaw(Batch):
         before: h^2/2 lambda_N and lambda_T at t_n of massless nodes [kg m], NaN of the others,
             shape (n, 3); None: there are none.
         varies: What the coefficient depends on; `friction` is that at rest then.
+        width: Slip [m] by which friction is blurred, see `blur_slip` in contact_law.c; 0: it is
+            not.
+        gap_width: The same of gaps, see `blur_gap`.
     """
 
     friction: float
@@ -169,6 +172,8 @@ class ContactLaw(Batch):
     rubs: Rub = Rub.LAW
     before: FloatArray | None = None
     varies: SlipFriction | None = None
+    width: float = 0.0
+    gap_width: float = 0.0
 
     # ---- multipliers
     @property
@@ -280,7 +285,8 @@ class ContactLaw(Batch):
         """What the compiled kernel is to know of the pairs in this step."""
         law = compiled_law.Law(
             self.scale, self.yielding, self.no_force, self.before,
-            self.row + self.num_constraints, self.row, opening=OPENING,
+            self.row + self.num_constraints, self.row, opening=OPENING, width=self.width,
+            gap_width=self.gap_width,
         )  # fmt: skip
         if self.num_tangential:
             prescribed = self.prescribed
@@ -364,13 +370,15 @@ class ContactLaw(Batch):
         Returns:
             friction_dissipation, contact_defect, massless_defect [J], active, stick, slip.
         """
-        slipping, gone = part.active & ~part.stick, ~part.active & self.massless
+        # Slips of rigid bodies that no motion closes count as sticking, and their work counts.
+        rubbing = part.active if self.redundant else part.active & ~part.stick
+        gone = ~part.active & self.massless
         dissipation, counts = 0.0, (0.0, 0.0)
         # Where it is closed, the gap is the solver's tolerance.
         left = float((part.multiplier[:, 0] * part.gap)[gone].sum())
         if self.num_tangential:
             work = part.multiplier[:, -2:] * part.slip
-            dissipation, left = float(work[slipping].sum()), left + float(work[gone].sum())
+            dissipation, left = float(work[rubbing].sum()), left + float(work[gone].sum())
             sticking = self.sticks(part)
             counts = float(sticking.sum()), float((part.active & ~sticking).sum())
         return {

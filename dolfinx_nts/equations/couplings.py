@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -74,7 +75,7 @@ class Couplings:
         self._linked = [np.array([linked[k] for k in of if k < declared]) for _, of in self.joints]
         self._loads = self._bearings(system)
         # Batches of elements of contacts and of edges in the step, which come first.
-        self._touching = 0
+        self.num_touching = 0
 
     def _bearings(self, system: System) -> dict[int, tuple[int, int, int]]:
         """Number among `joints` of each law that depends on what its joint carries.
@@ -107,7 +108,7 @@ class Couplings:
         self.contacts.begin(step, state.contacts, again, search)
         for edges in self.contacts.edges.values():
             edges.make()
-        self._touching = sum(len(coupling.elements) for coupling in self._of_contacts)
+        self.num_touching = sum(len(coupling.elements) for coupling in self._of_contacts)
         for coupling, of in self.joints:
             coupling.begin(step, itemgetter(*of)(state.joints), again, search)
 
@@ -129,7 +130,7 @@ class Couplings:
     @property
     def linked(self) -> list[Any]:
         """Number of the mechanism of each of `elements`, (n,) of many joints; None: of none."""
-        found: list[Any] = [None] * self._touching
+        found: list[Any] = [None] * self.num_touching
         for (coupling, _), linked in zip(self.joints, self._linked, strict=False):
             for batch in coupling.elements:
                 several = len(linked) > 1
@@ -141,7 +142,7 @@ class Couplings:
         """Of the batches among `elements` whose laws depend on what their joints carry."""
         if not self._loads:
             return {}
-        starts = np.cumsum([self._touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
+        starts = np.cumsum([self.num_touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
         found = {}
         for i, (k, row, bearing) in self._loads.items():
             (batch,) = self.joints[k].coupling.elements
@@ -178,7 +179,7 @@ class Couplings:
         self, e: Evaluation
     ) -> Iterator[tuple[JointCoupling, list[int], tuple[Any, ...]]]:
         """`joints` with their parts of an evaluation."""
-        start = self._touching
+        start = self.num_touching
         for coupling, of in self.joints:
             stop = start + len(coupling.elements)
             yield coupling, of, e.parts[start:stop]
@@ -201,6 +202,14 @@ class Couplings:
     def of_rubbing(self, e: Evaluation) -> list[MeasuredPart]:
         """Parts of an evaluation, of each of `rubbing`."""
         return [parts[0] for coupling, _, parts in self.of_joints(e) if rubs(coupling)]
+
+    def blur(self, width: float, gap_width: float) -> None:
+        """Let contacts of nodes and edges obey laws of these widths [m], see `ContactLaw`."""
+        for coupling in self._of_contacts:
+            coupling.elements = [
+                replace(c, law=replace(c.law, width=width, gap_width=gap_width))
+                for c in coupling.elements
+            ]
 
     def forget_solution(self) -> None:
         """Guess contact forces of t_n again, where those of a solution of the step led nowhere."""

@@ -89,7 +89,7 @@ class StepProblem:
         self.is_awake = np.zeros(self.batches.count, dtype=bool)
         self._numbers: tuple[Any, ...] | None = None
         self.couplings = Couplings(system)
-        self._shared = SharedWeight(system.comm, system.contacts)
+        self.shared_weight = SharedWeight(system.comm, system.contacts)
         self.unknowns: Unknowns | None = None
         self.version, self.dives = 0, False
         self._again: Evaluation | None = None
@@ -326,9 +326,9 @@ class StepProblem:
         own = laid.own_values(values, elements)
         self.couplings.tell_loads(own, self._bearing)
         parts = evaluate_together(self.system.comm, elements, positions, own)
-        contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)
-        self._shared.divide(
-            contacts.elements, contacts.bodies, parts[:touching], positions[:touching],
+        touching = self.couplings.num_touching
+        self.shared_weight.divide(
+            elements[:touching], self.couplings.bodies, parts[:touching], positions[:touching],
             self._closed,
         )  # fmt: skip
         return parts

@@ -3,7 +3,10 @@
 Gaps of a rigid box on a plane repeat each other from the fourth node on: of its contact forces only
 the resultants on each body act. Newton's matrix lends gaps a compliance (`constraints.SHIFT`), so
 that a part of the forces in the null space would be the rounding of the gaps over the compliance.
-Here the equations of the gaps say there that this part is zero, and nothing else.
+Here the equations of the gaps say there that this part is zero, and nothing else. Slips of nodes
+that stick repeat each other, too, and miss each other by what no motion closes, as where a face
+comes down on its edge: its turn takes nodes apart by half its square. Where that counts as none,
+the equations of the slips do without it.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.kernels.compiled_law import wrenches
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Square of the singular values that count as zero, over that of the largest.
 _NONE = 1e-12
@@ -34,19 +37,21 @@ _PASSES = 3
 
 
 class _Rows(NamedTuple):
-    """Active gaps of rigid bodies; axis 0 = gap.
+    """Active gaps, and slips of nodes that stick, of rigid bodies; axis 0 = row.
 
     Attributes:
         body: Numbers of both bodies, that of the first twice where there is no second, (n, 2).
         push: Force and moment of a unit force on each of them, shape (n, 2, 6).
-        value: Gap [m] and multiplier, shape (n, 2).
-        limit: Gap that counts as closed [m], shape (n,).
+        value: Gap or slip [m] and its multiplier, shape (n, 2).
+        limit: Gap or slip that counts as none [m], shape (n,).
+        is_gap: Which are gaps, shape (n,).
     """
 
     body: IntArray
     push: FloatArray
     value: FloatArray
     limit: FloatArray
+    is_gap: BoolArray
 
 
 def _is_rigid(pair: Any) -> bool:
@@ -55,11 +60,18 @@ def _is_rigid(pair: Any) -> bool:
 
 
 class SharedWeight:
-    """Gaps of rigid bodies without what is redundant in them."""
+    """Gaps and slips of rigid bodies without what is redundant in them.
+
+    Attributes:
+        any_rigid: Whether any contact is of rigid bodies alone.
+        kept: Whether forces in the null space stay as they are: those of blurred laws press
+            everywhere, and the least of them might pull.
+    """
 
     def __init__(self, comm: MPI.Comm, contacts: Sequence[ContactPair]) -> None:
         self._comm = comm
-        self._any = any(_is_rigid(pair) for pair in contacts)
+        self.any_rigid = any(_is_rigid(pair) for pair in contacts)
+        self.kept = False
 
     def divide(
         self,
@@ -69,11 +81,12 @@ class SharedWeight:
         places: Sequence[FloatArray],
         closed: Callable[[ContactElements], float],
     ) -> None:
-        """Write the rows of active gaps anew, (1 - P) g - c P lambda = 0. Collective.
+        """Write the rows of gaps and slips anew, (1 - P) g - c P lambda = 0. Collective.
 
-        P projects on the null space of what forces along the normals push the bodies with at
-        t_{n+1}, c is the compliance that the matrix lends. As c stands in the matrix, too, the
-        iteration takes P lambda out, and the gaps close as without it: P g vanishes with the rest.
+        P projects on the null space of what these forces push the bodies with at t_{n+1}, in
+        P lambda of those along the normals alone; c is the compliance that the matrix lends. As c
+        stands in the matrix, too, the iteration takes P lambda out, and the gaps close as without
+        it: P g vanishes with the rest.
         Where it does not, as of feet that lie in no plane, gaps cannot all close, and some node has
         to leave: the rows of bodies that touch each other stay as they are then.
 
@@ -84,34 +97,55 @@ class SharedWeight:
             places: Nodes of the batches [m], as of `Elements.evaluate`.
             closed: Gap of a batch that counts as closed [m].
         """
-        if not self._any:
+        if not self.any_rigid:
             return
         found, chosen = [], []
-        for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=True):
+        for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=False):
             on = np.flatnonzero(part.active)
-            if on.size and _is_rigid(batch.pair):
-                scale = batch.law.scale[on]
-                found.append(_rows(batch, numbers, part, x, on, closed(batch)))
-                chosen.append((part, on, batch.gap_row, scale))
+            if not on.size or not _is_rigid(batch.pair) or batch.law.gap_width:
+                continue
+            law = batch.law
+            which: list[tuple[IntArray, int, Any]] = [(on, batch.gap_row, closed(batch))]
+            moved = law.prescribed is not None and law.prescribed.any
+            if law.num_tangential and not law.width and not moved:
+                sticks = np.flatnonzero(part.active & part.stick)
+                last = batch.gap_row + law.num_constraints
+                which += [(sticks, row, law.still[sticks]) for row in (last - 2, last - 1)]
+            for of, row, limit in which:
+                found.append(_rows(batch, numbers, part, x, of, row, limit))
+                chosen.append((part, of, row, batch.law.scale[of], row == batch.gap_row))
         own = _joined(found)
         every = self._comm.allgather(own) if self._comm.size > 1 else [own]
         rows = _joined(every)
         if not len(rows.body):
             return
         first = sum(len(other.body) for other in every[: self._comm.rank])
-        null = _null_part(rows)[first : first + len(own.body)]
-        ends = np.cumsum([0] + [len(on) for _, on, _, _ in chosen])
-        for (part, on, row, scale), (start, stop) in zip(chosen, pairwise(ends), strict=True):
-            lent = -part.tangent[on, row, row] / scale**2
-            none = null[start:stop]
-            part.residual[on, row] -= scale * (none[:, 0] + lent * none[:, 1])
+        here = slice(first, first + len(own.body))
+        null = _null_part(rows)[here, 0]
+        forces = np.zeros(len(null))
+        if not self.kept:
+            gaps = np.flatnonzero(rows.is_gap)
+            both = np.zeros(len(rows.body))
+            both[gaps] = _null_part(_Rows._make(a[gaps] for a in rows))[:, 1]
+            forces = both[here]
+        ends = np.cumsum([0] + [len(on) for _, on, *_ in chosen])
+        for (part, on, row, scale, is_gap), (start, stop) in zip(
+            chosen, pairwise(ends), strict=True
+        ):
+            part.residual[on, row] -= scale * null[start:stop]
+            if is_gap:
+                lent = -part.tangent[on, row, row] / scale**2
+                part.residual[on, row] -= scale * lent * forces[start:stop]
 
 
 def _joined(rows: Sequence[_Rows]) -> _Rows:
     """Those of several batches or ranks, one after the other."""
     if len(rows) == 1:
         return rows[0]
-    none = np.empty((0, 2), dtype=int), np.empty((0, 2, 6)), np.empty((0, 2)), np.empty(0)
+    none = (
+        np.empty((0, 2), dtype=int), np.empty((0, 2, 6)), np.empty((0, 2)), np.empty(0),
+        np.empty(0, dtype=bool),
+    )  # fmt: skip
     return _Rows(*map(np.concatenate, zip(none, *rows, strict=True)))
 
 
@@ -121,22 +155,24 @@ def _rows(
     part: Contribution,
     x: FloatArray,
     on: IntArray,
-    closed: float,
+    row: int,
+    limit: Any,
 ) -> _Rows:
     push, start, scale = np.zeros((len(on), 2, 6)), 0, batch.law.scale[on]
-    rows = part.tangent[on, batch.gap_row, : batch.num_coordinates] / scale[:, None]
+    rows = part.tangent[on, row, : batch.num_coordinates] / scale[:, None]
     y = x[on]
     force = rows.reshape(y.shape)
     for k, side in enumerate(batch.attachment.sides):
         here = slice(start, start + side.nodes.shape[1])
         push[:, k] = wrenches(y[:, here], force[:, here], side.places[on], side.fixed[on])
         start = here.stop
-    gap = part.residual[on, batch.gap_row] / scale
+    value = part.residual[on, row] / scale
     return _Rows(
         np.tile([numbers[0], numbers[-1]], (len(on), 1)),
         push,
-        np.column_stack([gap, part.multiplier[on, 0]]),
-        np.full(len(on), closed),
+        np.column_stack([value, part.multiplier[on, row - batch.gap_row]]),
+        np.broadcast_to(limit, value.shape),
+        np.full(len(on), row == batch.gap_row),
     )
 
 

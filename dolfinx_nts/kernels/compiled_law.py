@@ -30,6 +30,8 @@ class Law(NamedTuple):
         opening: Part of `yielding` by which a gap that is open counts against a force.
         hardly: Stiffness against sliding of pairs that hardly rub, over `yielding`; 0: they do as
             Coulomb's law says.
+        width: As of `ContactLaw`.
+        gap_width: As of `ContactLaw`.
         tangential_scale: Algorithmic scale of the return map, shape (n,).
         unmoved: Projector on what of lambda_T acts on prescribed coordinates only, shape
             (n, 2, 2); None: nothing is prescribed.
@@ -53,6 +55,8 @@ class Law(NamedTuple):
     uneven: float = 1.0
     opening: float = 1.0
     hardly: float = 0.0
+    width: float = 0.0
+    gap_width: float = 0.0
     tangential_scale: FloatArray | None = None
     unmoved: FloatArray | None = None
     coefficients: FloatArray | None = None

@@ -2,51 +2,9 @@
 
    tests/twins has the same in NumPy, which tests/kernels/test_compiled.py compares with this. */
 
-#include "facets.h"
+#include "contact_law.h"
 
 /* ---- the laws */
-
-/* What the pairs have in common, and what each has of its own in a step; `before` is NULL without
-   massless nodes, `unmoved` where nothing is prescribed; `coefficients`, with their derivatives by the distance of
-   the slip and by the force that presses, are NULL where all pairs have the same constant coefficient. */
-typedef struct {
-    const double *scale, *yielding, *none, *before;
-    int size, row, friction, endless, strong, redundant;
-    double coefficient, pull, uneven, opening, hardly;
-    const double *tangential_scale, *unmoved, *coefficients, *by_slip, *by_force;
-} Law;
-
-typedef struct {
-    double force, normal, tangential;
-} Together;
-
-/* Slip [2], metric [2][2] and their gradients [2][size] and [2][2][size]. */
-typedef struct {
-    const double *value, *gradient, *metric, *metric_gradient;
-} Slip;
-
-/* Contravariant components of covariant ones. */
-static void raise(const double *m, const double *t, double *out)
-{
-    double determinant = m[0] * m[3] - m[1] * m[1];
-    out[0] = (m[3] * t[0] - m[1] * t[1]) / determinant;
-    out[1] = (m[0] * t[1] - m[1] * t[0]) / determinant;
-}
-
-static double length(const double *m, const double *t)
-{
-    double up[2];
-    raise(m, t, up);
-    return sqrt(t[0] * up[0] + t[1] * up[1]);
-}
-
-static double distance_of(const Slip *slip)
-{
-    const double *m = slip->metric, *s = slip->value;
-    return sqrt(s[0] * (m[0] * s[0] + m[1] * s[1]) + s[1] * (m[2] * s[0] + m[3] * s[1]));
-}
-
-static int any(const double *a) { return a && (a[0] != 0.0 || a[1] != 0.0 || a[2] != 0.0 || a[3] != 0.0); }
 
 /* Pull up to which a node that sticks is not let go. */
 static double pull_of(const Law *law, const Slip *slip, double c, const double *t, const double *unmoved)
@@ -255,10 +213,17 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
                     && !(let_go && let_go[i]);
         stick[i] = 0;
         distance[i] = active[i] && law->friction ? distance_of(&slip) : 0.0;
-        if (active[i]) {
+        Press press = {larger(-last[0], 0.0), -of_end, 0.0};
+        if (law->gap_width > 0.0 && !(let_go && let_go[i]))
+            active[i] = blur_gap(law, last[0], of_end, law->yielding[i], r, k, &press);
+        else if (active[i])
             gap_row[row] -= together->normal / scale;
+        if (active[i] || (law->gap_width > 0.0 && !(let_go && let_go[i]))) {
             if (law->hardly > 0.0)
                 rub_hardly(law, &slip, last, of_end, scale, law->yielding[i], r, k);
+            else if (law->friction && law->width > 0.0)
+                stick[i] = blur_slip(law, law->coefficients ? law->coefficients[i] : law->coefficient, &slip, last,
+                                     of_end, scale, &press, r, k);
             else if (law->friction)
                 stick[i] = rub(law, i, together, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
                                unmoved ? held + 4 * i : NULL, r, k);

@@ -21,7 +21,7 @@ import numpy as np
 
 _NAMES = (
     *("facets.h", "nts_element.h", "facets.c", "nts_element.c", "surface_points.c"),
-    *("segments.c", "contact_law.c", "edges.c", "constraints.c", "node_sums.c"),
+    *("segments.c", "contact_law.h", "contact_law.c", "edges.c", "constraints.c", "node_sums.c"),
     "measures.c",
 )
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
@@ -60,6 +60,7 @@ class Law(ctypes.Structure):
         *((name, _ARRAY) for name in ("scale", "yielding", "none", "before")),
         *((name, _INT) for name in ("size", "row", "friction", "endless", "strong", "redundant")),
         *((name, _REAL) for name in ("coefficient", "pull", "uneven", "opening", "hardly")),
+        *((name, _REAL) for name in ("width", "gap_width")),
         *((name, _ARRAY) for name in ("tangential_scale", "unmoved")),
         *((name, _ARRAY) for name in ("coefficients", "by_slip", "by_force")),
     ]

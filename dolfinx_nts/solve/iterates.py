@@ -9,6 +9,7 @@ from dolfinx_nts.contact.contact_law import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
+from dolfinx_nts.solve.blurred_contacts import BlurredContacts
 from dolfinx_nts.solve.rubbing_joints import RubbingJoints
 from dolfinx_nts.types import IntArray
 
@@ -29,7 +30,8 @@ class Iterates:
     Attributes:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.
-        led: How many iterates of the attempt friction of joints has led, see `RubbingJoints`.
+        led: How many iterates of the attempt blurred laws have led, see `RubbingJoints` and
+            `BlurredContacts`.
         imposed: Whether the last iterate was evaluated with contacts that its laws would change.
         runs_away: Whether nodes that hardly rub slid so far that friction must be what holds them.
     """
@@ -37,6 +39,7 @@ class Iterates:
     def __init__(self, problem: StepProblem) -> None:
         self._problem, self._sliding = problem, 0
         self._joints = RubbingJoints(problem)
+        self._contacts = BlurredContacts(problem)
         self.restart()
 
     def restart(self) -> None:
@@ -48,6 +51,7 @@ class Iterates:
         self.runs_away, self._slid_by = False, 0.0
         self.led = 0
         self._joints.restart()
+        self._contacts.try_again()
         self._rub_by_law()
 
     def slide_first(self) -> None:
@@ -74,6 +78,7 @@ class Iterates:
         self._fewest, self._patience = np.inf, _PATIENCE
         self.led = 0
         self._joints.try_again()
+        self._contacts.try_again()
 
     def at(self, x: PETSc.Vec) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one. Collective."""
@@ -94,6 +99,10 @@ class Iterates:
             # Friction that has let go of what it alone holds.
             self._look_far(new, _FAR)
             self._slid_by = 0.0
+        elif last is not None and not self.imposed and self._may_blur:
+            new, led = self._contacts.at(last, new, x)
+            self.led += led
+            self.imposed |= led
         if last is not None and self._problem.couplings.rubbing:
             new, led = self._joints.at(last, new, x)
             self.led += led
@@ -177,6 +186,19 @@ class Iterates:
         self.imposed = True
         with contacts.imposed(before), np.errstate(over="ignore", invalid="ignore"):
             return self._problem.evaluate(x)
+
+    @property
+    def _may_blur(self) -> bool:
+        """Whether contacts may be blurred: of rigid bodies more nodes touch than are needed.
+
+        In statics it is the state that cycles.
+        """
+        problem = self._problem
+        return (
+            problem.integrator.inertia
+            and problem.shared_weight.any_rigid
+            and problem.couplings.num_touching > 0
+        )
 
     @property
     def settled(self) -> bool:

@@ -91,3 +91,36 @@ def test_what_is_far_apart_is_left_out(monkeypatch):
     assert table["active"].max() > 0
     assert np.array_equal(table["energy"], all_of_them["energy"])
     assert np.array_equal(places, others)
+
+
+@pytest.mark.slow
+@pytest.mark.fast_on_ranks()
+def test_bricks_dropped_on_each_other_come_to_rest():
+    """One brick over the joint of two, all dropped.
+
+    Which nodes touch, stick and slip does not settle by the laws alone. At rest each brick lies
+    where it was built, and either lower one carries its own weight and half of the upper one's.
+    """
+    wide, high = 0.2, 0.1
+    bodies = [
+        nts.RigidBody(
+            box([x, 0.0, z + fall], [x + wide, 0.1, z + high + fall], 1), density=1e3, name=name
+        )
+        for name, x, z, fall in (
+            ("left", 0.0, 0.0, 1e-4), ("right", 0.21, 0.0, 1e-4), ("upper", 0.105, high, 2e-4)
+        )
+    ]  # fmt: skip
+    left, right, upper = (body.surface(everywhere) for body in bodies)
+    floor = nts.Plane((0, 0, 0), (0, 0, 1))
+    both = [(left, floor), (right, floor), (upper, left), (upper, right)]
+    contacts = [nts.ContactPair(*pair, friction=0.4) for pair in both]
+    system = nts.System(bodies, contacts=contacts, gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.GeneralizedAlpha(rho_inf=0.5), dt=2e-3, t_end=0.1)
+    # The scheme is not one that keeps energy, as the status says.
+    assert run.status.startswith("completed")
+    table, weight = run.balance, 1e3 * wide * high * 0.1 * G
+    assert table["kinetic"][-1] < 1e-6 * table["external_work"][-1]
+    for body, z in zip(bodies, (0.5, 0.5, 1.5), strict=True):
+        assert abs(body.position[2] - z * high) < 1e-9 * high
+    carried = run.contact_forces[-1, :, 2] / weight
+    assert np.abs(carried - [1.5, 1.5, 0.5, 0.5]).max() < 1e-6

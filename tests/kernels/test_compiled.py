@@ -1,6 +1,7 @@
 """The compiled kernels against their twins in NumPy, and what is told without a compiler."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 from mpi4py import MPI
 
@@ -126,6 +127,50 @@ def test_laws_are_those_of_numpy(law, shared, prescribed, massless):
     if obeyed.num_tangential and law != "rubs hardly":
         assert (here.active & here.stick).any()
         assert (here.active & ~here.stick).any() or np.isinf(obeyed.friction)
+
+
+#: Width over the size of facets.
+WIDTH = 0.05
+
+
+@pytest.mark.parametrize("gaps", [True, False])
+def test_blurred_laws_hold_where_forces_are_theirs(gaps):
+    """Rows vanish for force times gap = (c width)^2 and Coulomb's bound over slip and width.
+
+    There, where the slope of friction is no mere estimate, differences of them are the tangent.
+    """
+    measure, obeyed, x, multiplier = batches(
+        "friction", shared=False, prescribed=False, massless=False
+    )
+    rng, width = np.random.default_rng(3), WIDTH
+    obeyed = replace(obeyed, width=width, gap_width=width if gaps else 0.0)
+    x[:, 0] = measure.start[:, 0] + 0.02 * rng.normal(size=(N, 3))
+    x[:, 1:] = measure.start[:, 1:]
+    # Slaves in front of their facets.
+    apart = measure.evaluate(x, None, multiplier).gap
+    x[:, 0] += (0.03 + np.abs(apart))[:, None] * measure.normal
+    gap, slip = (getattr(measure.evaluate(x, None, multiplier), name) for name in ("gap", "slip"))
+    assert gap.min() > 0.0
+    press = obeyed.yielding * width**2 / gap if gaps else np.full(N, 3.0)
+    low = np.einsum("nab,nb->na", slip.metric, slip.value)
+    far = np.sqrt(np.einsum("na,na->n", low, slip.value) + width**2)
+    given = np.column_stack([-press, 0.3 * (press / far)[:, None] * low])
+
+    def rows(x, given):
+        measured = measure.evaluate(x, None, given)
+        return obeyed.obey(x, measured, given, Together(0.0, 0.0, 0.0))
+
+    here = rows(x, given)
+    first = 0 if gaps else 1
+    scale = obeyed.scale[:, None]
+    assert here.active.all() or gaps
+    assert (np.abs(here.residual[:, 15 + first :]) / scale < 1e-13).all()
+    step, way, push = 1e-6, rng.normal(size=x.shape), rng.normal(size=given.shape)
+    ahead, behind = (rows(x + s * way, given + s * push).residual for s in (step, -step))
+    slope = (ahead - behind)[:, 15 + first :] / (2.0 * step)
+    both = np.concatenate([way.reshape(N, -1), push / scale], axis=1)
+    found = np.einsum("nrz,nz->nr", here.tangent, both)[:, 15 + first :]
+    assert relative(found, slope) < 1e-7
 
 
 @pytest.mark.parametrize("rule", ["mean-value", "direct"])
