@@ -12,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.kernels import library
-from dolfinx_nts.types import Array, FloatArray
+from dolfinx_nts.types import Array, FloatArray, IntArray
 
 T = TypeVar("T")
 
@@ -27,11 +27,23 @@ def rank_of(name: str, comm: MPI.Comm) -> int:
     return (stem + int(numbers[-1] if numbers else 0)) % int(comm.size)
 
 
-def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
-    """Rows of all ranks in rank order, on every rank."""
+def gather_rows(comm: MPI.Comm, rows: Array, counts: IntArray | None = None) -> Array:
+    """Rows of all ranks in rank order, on every rank.
+
+    Args:
+        comm: MPI communicator.
+        rows: This rank's.
+        counts: How many each rank has, if that is known: then ranks need not tell each other, and
+            rows of one type and width travel in one call.
+    """
     if comm.size == 1:  # pickling takes longer than the rows
         return rows.copy()
-    return np.concatenate(comm.allgather(rows))
+    if counts is None:
+        return np.concatenate(comm.allgather(rows))
+    out = np.empty((int(counts.sum()), *rows.shape[1:]), dtype=rows.dtype)
+    width = int(np.prod(rows.shape[1:]))
+    comm.Allgatherv(np.ascontiguousarray(rows), [out, (counts * width).tolist()])
+    return out
 
 
 def gather_on_root(comm: MPI.Comm, rows: Array) -> Array:
@@ -59,12 +71,13 @@ def _over_ranks(comm: MPI.Comm, values: FloatArray, op: Any) -> FloatArray:
 
 def anywhere(comm: MPI.Comm, flag: bool) -> bool:
     """Whether it holds on any rank, on every rank."""
-    return bool(flag) if comm.size == 1 else bool(comm.allreduce(bool(flag), op=MPI.LOR))
+    # A number: mpi4py sends a flag pickled, in messages and two broadcasts.
+    return bool(global_max(comm, np.array([float(flag)]))[0])
 
 
 def everywhere(comm: MPI.Comm, flag: bool) -> bool:
     """Whether it holds on all ranks, on every rank."""
-    return bool(flag) if comm.size == 1 else bool(comm.allreduce(bool(flag), op=MPI.LAND))
+    return not anywhere(comm, not flag)
 
 
 def first_problem(comm: MPI.Comm, problem: str | None) -> str | None:

@@ -82,15 +82,18 @@ class Points:
         return self.select((slice(None), chosen))
 
     @cached_property
-    def _table(self) -> tuple[IntArray, IntArray]:
-        """Rows of this rank's nodes among its owned ones, and where each node is. Collective."""
+    def _table(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Rows of this rank's nodes among its owned ones, where each node is, counts of rows.
+
+        The counts are those of all ranks. Collective.
+        """
         used, index = np.unique(self.nodes, return_inverse=True)
         used = np.unique(gather_rows(self.body.comm, used))
         index = np.searchsorted(used, self.nodes)
         count = self.body.num_owned // 3
         first = self.body.comm.exscan(count) or 0
         own = used[(used >= first) & (used < first + count)]
-        return own - first, index
+        return own - first, index, np.array(self.body.comm.allgather(len(own)))
 
     def nodal(self, values: Array) -> Array:
         """Values at the nodes of all points, (n, k, 3), from this rank's coordinates. Collective.
@@ -98,8 +101,8 @@ class Points:
         Args:
             values: At this rank's owned coordinates, shape (num_owned,).
         """
-        rows, index = self._table
-        table = gather_rows(self.body.comm, values.reshape(-1, 3)[rows])
+        rows, index, counts = self._table
+        table = gather_rows(self.body.comm, values.reshape(-1, 3)[rows], counts)
         return table[index]
 
     def gathered(self, values: FloatArray) -> FloatArray:
