@@ -73,7 +73,7 @@ class Calls:
     Attributes:
         number: Calls by (owner, name).
         sent: Bytes that this rank gave to them, by the same.
-        lines: Calls of the package by (name, file and line).
+        lines: Calls by (owner, name, file and line of Python).
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Calls:
         self.number, self.sent = Counter[Any](), Counter[Any]()
         self.lines = Counter[Any]()
         code = _HEAD + "".join(
-            f"int {name}({given}) {{ tell(\"{name}\", __builtin_return_address(0), {size}); "
+            f'int {name}({given}) {{ tell("{name}", __builtin_return_address(0), {size}); '
             f"return P{name}({call}); }}\n"
             for name, (given, call, size) in (COLLECTIVE | MESSAGES).items()
         )
@@ -114,12 +114,7 @@ class Calls:
         call = name.decode()
         self.number[owner, call] += 1
         self.sent[owner, call] += size
-        if owner == "package":
-            frame = sys._getframe(1)
-            place = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
-            if place.startswith("parallel.py") and frame.f_back is not None:
-                outer = frame.f_back
-                while outer.f_code.co_filename == frame.f_code.co_filename and outer.f_back:
-                    outer = outer.f_back
-                place = f"{Path(outer.f_code.co_filename).name}:{outer.f_lineno}"
-            self.lines[call, place] += 1
+        frame = sys._getframe(1)
+        while frame.f_code.co_filename.endswith("dolfinx_nts/parallel.py") and frame.f_back:
+            frame = frame.f_back
+        self.lines[owner, call, f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"] += 1

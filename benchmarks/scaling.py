@@ -132,7 +132,7 @@ def count(comm: MPI.Comm, name: str) -> tuple[dict[str, Any], list[tuple[str, fl
         "krylov": krylov / _STEPS, **dict(zip(of_rank, most.tolist(), strict=True)),
         "uneven_coordinates": uneven[0], "uneven_slaves": uneven[1],
     }  # fmt: skip
-    lines = [(f"{k} {at}", n / _STEPS) for (k, at), n in CALLS.lines.most_common()]
+    lines = [(" ".join(key), n / _STEPS) for key, n in CALLS.lines.most_common()]
     stepper.close()
     return row, lines
 
@@ -166,7 +166,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--table", type=Path, default=Path("out/scaling.csv"))
-    parser.add_argument("--lines", action="store_true", help="print the package's calls by line")
+    parser.add_argument("--lines", action="store_true", help="print rank 0's calls a step by line")
     parser.add_argument("--draw", type=Path, help="write this picture of the table, and end")
     options = parser.parse_args()
     if options.draw:
