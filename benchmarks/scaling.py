@@ -62,8 +62,8 @@ SCENES: dict[str, Callable[[MPI.Comm], nts.System]] = {
     "weak": lambda comm: cubes(comm, round(_WEAK * comm.size ** (1 / 3)), gap=1e-3),
     "strong": lambda comm: cubes(comm, _STRONG, gap=1e-3),
     "surfaces": plates,
-    "bodies": lambda comm: heap(comm, 100, 0.3),
-    "few_bodies": lambda comm: heap(comm, 25, 0.3),
+    "25 bodies": lambda comm: heap(comm, 25, 0.3),
+    "100 bodies": lambda comm: heap(comm, 100, 0.3),
 }
 
 
@@ -153,11 +153,12 @@ def draw(table: Path, to: Path) -> None:
         for name in SCENES:
             own = [r for r in rows if r["scene"] == name and float(r[key]) > 0.0]
             ax.plot([int(r["ranks"]) for r in own], [float(r[key]) for r in own], "o-", label=name)
-        ax.set(title=title, xscale="log", yscale="log", xlabel="ranks", xticks=[1, 2, 4, 8])
+        scale = "linear" if key == "memory_MB" else "log"
+        ax.set(title=title, xscale="log", yscale=scale, xlabel="ranks")
         ax.set_xticks([1, 2, 4, 8], ["1", "2", "4", "8"])
         ax.minorticks_off()
         ax.grid(alpha=0.3)
-    axes[0, 0].legend()
+    axes[1, 2].legend(loc="upper right")
     figure.savefig(to, dpi=110)
 
 
