@@ -13,7 +13,6 @@ from scenes import box, green, saint_venant
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.output import Fields
-from dolfinx_nts.output.pictures import picture
 
 COMM = MPI.COMM_WORLD
 YOUNG, POISSON, RHO = 2e5, 0.3, 1e3
@@ -294,5 +293,3 @@ def test_spaces_and_surfaces_that_are_refused():
     )
     with pytest.raises(ValueError, match="boundaries of 3D meshes, not of intervals"):
         string.surface(lambda x: x[0] < 1.0)
-    with pytest.raises(ValueError, match="'body' has no volume"):
-        picture([string], "string.png")
