@@ -65,9 +65,11 @@ def test_two_runs_of_one_system_in_turns_are_those_one_after_the_other(reuse):
 
     system = rubbing_blocks(0.3)
     apart, mixed = ends(system, False), ends(system, True)
+    # Ranks of MUMPS add up in the order in which their messages come.
+    same = 0.0 if system.comm.size == 1 else 1e-12
     for one, other in zip(apart, mixed, strict=True):
         assert one["active"].max() >= 4
-        assert difference(one, other) <= (1e-9 if reuse else 0.0)
+        assert difference(one, other) <= (1e-9 if reuse else same)
 
 
 @pytest.mark.slow
