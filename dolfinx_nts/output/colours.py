@@ -125,8 +125,10 @@ def _of_function(
     nodal = fem.Function(scalars)
     nodal.interpolate(function)
     nodal.x.scatter_forward()
+    # DOLFINx 0.11 has a list of one array.
+    of_vector = np.ravel(of_vector)
     values = np.empty(len(of_vector))
-    values[np.asarray(of_vector) // 3] = nodal.x.array
+    values[of_vector // 3] = nodal.x.array
     return values[corners]
 
 
