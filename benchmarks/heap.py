@@ -1,11 +1,14 @@
 """A heap: rigid cubes and balls with friction fall into a box without a lid, every two a contact.
 
-    python benchmarks/heap.py [--bodies 10 40 100] [--friction 0.4] [--t-end 0.2] [--dt 2e-3]
+    python benchmarks/heap.py [--bodies 10 40 100] [--friction 0.4] [--t-end 0.2]
+                             [--dt 2e-3] [--rest]
 
 Cubes (edges of 0.09 to 0.1) and balls of 24 facets (diameter 0.1) alternate. They start in layers,
 0.2 apart, turned at random. Printed are the time to make the scene and the run, a step's in free
 flight and in the mean, Newton iterations, cut steps, the deepest vertex of any body inside a cube
-(by half spaces, apart from the package), and what the ledger misses over the largest energy.
+(by half spaces, apart from the package), what the ledger misses over the largest energy, and the
+kinetic energy at the end over the work of gravity. `--rest` takes `GeneralizedAlpha(rho_inf=0.5)`
+in place of `EnergyMomentum`.
 """
 
 import argparse
@@ -83,11 +86,13 @@ def depth(system):
     return deepest
 
 
-def main(bodies, friction=0.4, t_end=0.2, dt=2e-3, progress=False):
+def main(bodies, friction=0.4, t_end=0.2, dt=2e-3, rest=False, progress=False):
     """One heap."""
     begin = time.process_time()
     system = scene(MPI.COMM_WORLD, bodies, friction)
-    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    stepper = nts.Stepper(
+        system, nts.GeneralizedAlpha(rho_inf=0.5) if rest else nts.EnergyMomentum()
+    )
     stepper.advance(dt)
     made, times, deepest = time.process_time() - begin, [], 0.0
     while stepper.state.time < t_end - 0.5 * dt:
@@ -104,6 +109,7 @@ def main(bodies, friction=0.4, t_end=0.2, dt=2e-3, progress=False):
         "iterations": float(table["newton_iterations"][1:].mean()),
         "most": int(table["newton_iterations"].max()), "retries": stepper.solution.retries,
         "touching": int(table["active"].max()), "depth": deepest,
+        "unrest": float(table["kinetic"][-1] / table["external_work"][-1]),
         "ledger": float(np.abs(table["ledger_residual"]).max() / top),
     }  # fmt: skip
 
@@ -114,6 +120,7 @@ if __name__ == "__main__":
     parser.add_argument("--friction", type=float, default=0.4)
     parser.add_argument("--t-end", type=float, default=0.2, help="[s]")
     parser.add_argument("--dt", type=float, default=2e-3, help="[s]")
+    parser.add_argument("--rest", action="store_true")
     parser.add_argument("--progress", action="store_true")
     options = vars(parser.parse_args())
     for number in options.pop("bodies"):

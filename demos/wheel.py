@@ -47,10 +47,10 @@ SHOWN = ("height", "effective", "tread", "slipped", "peak", "lowest", "speed", "
          "friction", "contact_defect", "ledger", "momentum", "carriage")  # fmt: skip
 
 
-def ring(comm, radii, facets, centre):
+def ring(comm, radii, facets, centre, width=WIDTH):
     """Hexahedra between these radii about an axle along y, built on rank 0; a flat below."""
     angle = 2 * np.pi * (np.arange(facets) + 0.5) / facets
-    r, y, t = np.meshgrid(radii, [-0.5 * WIDTH, 0.5 * WIDTH], angle, indexing="ij")
+    r, y, t = np.meshgrid(radii, [-0.5 * width, 0.5 * width], angle, indexing="ij")
     points = np.column_stack([(r * np.sin(t)).ravel(), y.ravel(), -(r * np.cos(t)).ravel()])
     here = np.arange(len(points)).reshape(r.shape)
     sides = [
@@ -219,9 +219,10 @@ def plot(r, folder):
     plt.close(figure)
 
 
-def report(r, facets):
-    print(f"tyre of {facets} facets over a step: {r['status']}")
-    for name in SHOWN:
+def report(what, r, shown):
+    """Print figures of a run of something."""
+    print(f"{what}: {r['status']}")
+    for name in shown:
         print(f"  {name:16}{r[name]:>12.5g}")
     print(f"  {r['newton_iterations']:.2f} iterations a step, {r['retries']} retries, "
           f"{r['seconds']:.0f} s")  # fmt: skip
@@ -258,7 +259,7 @@ def main(
     if folder:
         picture(run, folder / "wheel.png", view=(10.0, -80.0))
     if comm.rank == 0:
-        report(r, facets)
+        report(f"tyre of {facets} facets over a step", r, SHOWN)
         if folder:
             plot(r, folder)
     return r

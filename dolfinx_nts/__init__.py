@@ -28,6 +28,7 @@ from dolfinx_nts.bodies.solid.rubber import ArrudaBoyce, Yeoh
 from dolfinx_nts.bodies.solid.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
+from dolfinx_nts.contact.obstacle_surface import ObstacleSurfacePair
 from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.self_contact import SelfContact
@@ -130,6 +131,7 @@ __all__ = [
     "Newton",
     "Obstacle",
     "ObstaclePair",
+    "ObstacleSurfacePair",
     "Ogden",
     "OutputError",
     "Part",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
+from functools import cache
 from typing import Any, TypeVar
 
 from mpi4py import MPI
@@ -15,6 +16,8 @@ from dolfinx_nts.kernels import library
 from dolfinx_nts.types import Array, FloatArray, IntArray
 
 T = TypeVar("T")
+#: Work that asks all ranks now and then, see `together`.
+Asking = Generator[Any, Any, T]
 
 
 def rank_of(name: str, comm: MPI.Comm) -> int:
@@ -69,6 +72,34 @@ def _over_ranks(comm: MPI.Comm, values: FloatArray, op: Any) -> FloatArray:
     return out
 
 
+def sums_and_largest(
+    comm: MPI.Comm, sums: FloatArray, sizes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Sums of some values (n,) and largest of others (m,) over all ranks, in one call. Collective.
+
+    Unlike MPI's, this maximum is NaN if one is.
+    """
+    if comm.size == 1:
+        return sums.copy(), sizes.copy()
+    # One item of a type of its own: MPI may cut several up, and give an operation the parts.
+    out = np.concatenate([[float(len(sums))], sums, sizes])
+    item = MPI.DOUBLE.Create_contiguous(len(out)).Commit()
+    comm.Allreduce(MPI.IN_PLACE, [out, 1, item], op=_sum_and_largest())
+    item.Free()
+    return out[1 : 1 + len(sums)], out[1 + len(sums) :]
+
+
+@cache
+def _sum_and_largest() -> MPI.Op:
+    def reduce(given: Any, to: Any, _: MPI.Datatype) -> None:
+        a, b = np.frombuffer(given), np.frombuffer(to)
+        n = 1 + int(a[0])
+        b[1:n] += a[1:n]
+        np.maximum(a[n:], b[n:], out=b[n:])
+
+    return MPI.Op.Create(reduce, commute=True)
+
+
 def anywhere(comm: MPI.Comm, flag: bool) -> bool:
     """Whether it holds on any rank, on every rank."""
     # A number: mpi4py sends a flag pickled, in messages and two broadcasts.
@@ -80,11 +111,62 @@ def everywhere(comm: MPI.Comm, flag: bool) -> bool:
     return not anywhere(comm, not flag)
 
 
+def together(comm: MPI.Comm, works: Iterable[Asking[T]]) -> list[T]:
+    """Results of works that ask all ranks, those of one round in the same calls. Collective.
+
+    A work yields a flag and is sent whether any rank has it, or two arrays and is sent sums of the
+    first one and the largest of the second one, without axes, or rows and is sent those of all
+    ranks, in rank order. Works and what each asks, in order, are the same on all ranks.
+    """
+    of = list(works)
+    results: list[Any] = [None] * len(of)
+    answers: dict[int, Any] = dict.fromkeys(range(len(of)))
+    while answers:
+        flags, rows = dict[int, bool](), dict[int, Array]()
+        pairs = dict[int, tuple[FloatArray, FloatArray]]()
+        for k, answer in answers.items():
+            try:
+                asked = of[k].send(answer)
+            except StopIteration as end:
+                results[k] = end.value
+            else:
+                kind: dict[int, Any] = rows if isinstance(asked, np.ndarray) else flags
+                if isinstance(asked, tuple):
+                    kind = pairs
+                kind[k] = asked
+        answers = {}
+        if flags or pairs:
+            answers.update(_reduced(comm, flags, pairs))
+        if rows:
+            own = list(rows.values())
+            ranks = comm.allgather(own) if comm.size > 1 else [own]
+            answers.update(zip(rows, map(np.concatenate, zip(*ranks, strict=True)), strict=True))
+    return results
+
+
+def _reduced(
+    comm: MPI.Comm, flags: dict[int, bool], pairs: dict[int, tuple[FloatArray, FloatArray]]
+) -> dict[int, Any]:
+    """Answers to those who ask for flags, and to those who ask for sums and maxima, in one call."""
+    given = [np.empty(0)], [np.array(list(flags.values()), dtype=np.float64)]
+    for pair in pairs.values():
+        for each, own in zip(given, pair, strict=True):
+            each.append(own.ravel())
+    found = sums_and_largest(comm, *map(np.concatenate, given))
+    (_, *sums), (held, *sizes) = (
+        np.split(all_of, np.cumsum([len(own) for own in each])[:-1])
+        for all_of, each in zip(found, given, strict=True)
+    )
+    answers: dict[int, Any] = dict(zip(flags, (held > 0.0).tolist(), strict=True))
+    return answers | dict(zip(pairs, zip(sums, sizes, strict=True), strict=True))
+
+
 def first_problem(comm: MPI.Comm, problem: str | None) -> str | None:
     """The first rank's problem, on every rank."""
-    if comm.size == 1:
-        return problem
-    return next((p for p in comm.allgather(problem) if p is not None), None)
+    # Mostly there is none, and a flag is one call where texts are two.
+    if not anywhere(comm, problem is not None):
+        return None
+    return next(p for p in comm.allgather(problem) if p is not None)
 
 
 def raise_together(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import gc
 import itertools
 import weakref
 from collections.abc import Iterator, Sequence
@@ -57,6 +58,8 @@ def _close() -> None:
     # What is left, PETSc would free after Python is gone, and ask Python for it.
     for _, owner in sorted(_OPEN.items()):
         owner.close()
+    # Of an owner that is gone, its preconditioners may wait for Python's collector.
+    gc.collect()
     for comm in _COMMUNICATORS:
         free_dropped(comm)
 

@@ -18,9 +18,9 @@ from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
-from dolfinx_nts.contact.shared_nodes import areas, check_shared
+from dolfinx_nts.contact.shared_nodes import carried_area, check_shared
 from dolfinx_nts.interaction.coupling import Joint, is_joint
-from dolfinx_nts.parallel import need_kernels
+from dolfinx_nts.parallel import need_kernels, together
 from dolfinx_nts.state import EdgeHistory, State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
@@ -250,10 +250,15 @@ class System:
             found[k] -= value
         return found
 
-    @cached_property
-    def slave_areas(self) -> list[FloatArray]:
-        """Area that carries at each point of each contact's slave [m^2], shape (points,)."""
-        return areas(self.contacts)
+    def slave_area(self, k: int, state: State) -> FloatArray:
+        """Present area that carries at each point of a slave [m^2], (points,). Collective.
+
+        Args:
+            k: Number of the contact.
+            state: Where the body is.
+        """
+        u = state.u[self.bodies.index(self.contacts[k].slave.body)]
+        return carried_area(self.contacts, k, u)
 
     def penetration(self, state: State, left: float = 0.0) -> list[FloatArray]:
         """Return how deep slaves lie behind their facets, in facet sizes, by contact. Collective.
@@ -282,7 +287,9 @@ class System:
             self.contacts, self.contact_bodies, state.contacts, strict=False
         ):
             positions = pair.positions([state.u[b] for b in bodies])
-            yield pair.find(positions, history.facet, pair.path(state.time, state.time)).candidates
+            path = pair.path(state.time, state.time)
+            (found,) = together(self.comm, [pair.find(positions, history.facet, path)])
+            yield found.candidates
 
     def with_overlap(self, state: State, left: float) -> State:
         """The state with the overlap of nodes that no load step has known, see `ContactHistory`.

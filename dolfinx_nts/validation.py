@@ -34,11 +34,14 @@ class StepFailedError(RuntimeError):
     Args:
         message: What failed.
         advises: Whether it says what to do, too.
+
+    Attributes:
+        part: Length of the step over that of the one asked for, where it was cut until it failed.
     """
 
     def __init__(self, message: str, *, advises: bool = False) -> None:
         super().__init__(message)
-        self.advises = advises
+        self.advises, self.part = advises, 1.0
 
 
 class UserFunctionError(StepFailedError, ValueError):

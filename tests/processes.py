@@ -22,6 +22,9 @@ SHARED = {
     "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
 }
 
+#: Time [s] that ranks under mpirun have.
+_PATIENCE = 600
+
 
 def environment_of_processes():
     """Return this process' variables without those of its own MPI, which would mislead others."""
@@ -54,13 +57,19 @@ def on_ranks(ranks: int, *arguments: str, well: bool = True) -> str:
         well: Whether it must succeed; else it must fail, and what it says on stderr is returned,
             too.
     """
-    done = subprocess.run(
-        [*mpirun(ranks), *arguments],
-        env=environment_of_processes() | {"PYTHONPATH": str(DEMOS)},
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
+    # Ranks that hang show where, before they are stopped.
+    tells = {"PYTEST_ADDOPTS": f"-o faulthandler_timeout={_PATIENCE - 120}"}
+    try:
+        done = subprocess.run(
+            [*mpirun(ranks), *arguments],
+            env=environment_of_processes() | tells | {"PYTHONPATH": str(DEMOS)},
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as late:
+        said = [text.decode(errors="replace") for text in (late.stdout, late.stderr) if text]
+        raise AssertionError("\n".join([str(late), *said])) from late
     assert (done.returncode == 0) == well, done.stdout + done.stderr
     return done.stdout if well else done.stdout + done.stderr

@@ -8,6 +8,7 @@ from point_mass import MASS, STEP, PointMass, PointSurface, turn
 from scenes import RUBBER, box
 
 import dolfinx_nts as nts
+from dolfinx_nts.parallel import together
 
 COMM = MPI.COMM_WORLD
 ACCELERATION = 9.81
@@ -86,7 +87,8 @@ class Pair:
     def at(self, unknowns):
         x, multiplier = unknowns[None, None, :3], unknowns[None, 3:]
         own = {"augmented": np.empty((1, 0)), "constraints": multiplier}
-        return self.step.evaluate(x - self.step.pair.origin, own)
+        work = self.step.evaluate(x - self.step.pair.origin, own)
+        return together(MPI.COMM_SELF, [work])[0]
 
 
 def block(low=(0.1, 0.1, 0.005), size=0.8, n=2, velocity=(0.3, 0.0, -1.0), name="block"):

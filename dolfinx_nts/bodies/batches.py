@@ -101,6 +101,12 @@ class Batches:
                 body.remember(found, own)
         return found
 
+    def share(self, *values: Sequence[FloatArray]) -> None:
+        """Let all ranks know those of batches of rigid bodies, see `Body.known`. Collective."""
+        for body in self.several if self.comm.size > 1 else ():
+            if isinstance(body, RigidBatch):
+                body.share(*values)
+
     def rates(self, state: State) -> tuple[list[FloatArray], list[FloatArray | None]]:
         """Velocities [m/s] of each batch and, of schemes that carry them, accelerations [m/s^2]."""
         return self.join(state.v), [*self.join(state.a)] if state.a else [None] * len(self.bodies)

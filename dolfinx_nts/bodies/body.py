@@ -50,8 +50,7 @@ class Body:
         bound: Whether its own constraints are half as many as its coordinates, or about that.
         has_inner: Whether forces depend on more than its coordinates, see `inner`.
         length: What its directors are multiples of [m].
-        rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
-            all ranks; None: the size of the positions.
+        rounded: Length [m], on all ranks, whose rounding enters forces beside u's; None: X's.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
         low_dets: `smallest_det` below which a run warns, and below which failed steps name it.
         has_massless: Whether coordinates on any rank have no mass.
@@ -59,8 +58,9 @@ class Body:
         made_on: Places of its mesh's nodes when it was made, see `places_of`; None without a mesh.
         starts_moved: Whether the user has given it a displacement to start with.
         pieces: Number of parts of its mesh that share no node, of solid bodies. Collective.
-        stressed: Stress of the undeformed body over its stiffness, once it is known and too large.
+        stressed: Stress of the undeformed body over its stiffness, once known and too large.
         losses: Columns of the balance table for energy that leaves through it, see `lost`.
+        known: Arrays at owned coordinates and what all ranks know of each, shape (nodes, 3).
         destroyed: Whether `destroy` was called.
     """
 
@@ -92,6 +92,7 @@ class Body:
     pieces: int = 1
     stressed: float | None = None
     losses: tuple[str, ...] = ()
+    known: tuple[tuple[FloatArray, FloatArray], ...] = ()
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
     _shown: tuple[FloatArray, ...] = ()
@@ -445,5 +446,5 @@ _PROTOCOL = tuple(
 
 
 def is_body(given: Any) -> bool:
-    """Return whether an object is a `Body` or has all that one has."""
+    """Whether an object is a `Body` or has all that one has."""
     return isinstance(given, Body) or all(hasattr(given, name) for name in _PROTOCOL)

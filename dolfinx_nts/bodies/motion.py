@@ -9,6 +9,7 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.types import FloatArray
 
 #: Part of the largest moment of inertia below which a smaller one counts as rounding ...
@@ -61,7 +62,7 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     place = body.reference + u
     weights = [body.nodal_mass, body.inertia(place), body.inertia(v)]
     local = np.concatenate([body.linear_momentum(w) for w in weights])
-    masses, first, momentum = body.comm.allreduce(local).reshape(3, 3)
+    masses, first, momentum = global_sum(body.comm, local).reshape(3, 3)
     mass = float(masses[0])
     centre, velocity = first / mass, momentum / mass
     # About the centre: far from the origin a difference of moments about it would lose digits.
@@ -70,7 +71,7 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     turning = [v - (moves * velocity).ravel()]
     turning += [np.cross(axis, arm).ravel() for axis in np.eye(3)]
     local = np.concatenate([body.angular_momentum(off, body.inertia(w)) for w in turning])
-    about, *columns = body.comm.allreduce(local).reshape(4, 3)
+    about, *columns = global_sum(body.comm, local).reshape(4, 3)
     inertia = 0.5 * (np.array(columns) + np.transpose(columns))
     moments, axes = np.linalg.eigh(inertia)
     least = max(_NO_ARM * moments[-1], mass * (_SAME_PLACE * np.linalg.norm(centre)) ** 2)

@@ -13,7 +13,7 @@ from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.pair import MARGIN, ContactPair
 from dolfinx_nts.contact.search import ROUNDING
-from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.state import ContactHistory
@@ -81,9 +81,11 @@ class Apart:
         pairs = self._pairs[asked]
         boxes = np.zeros((len(self._surfaces), 2, 3))
         sizes = np.zeros(len(boxes))
-        for i in np.unique(pairs):
-            surface = self._surfaces[i]
-            x = surface.positions(u[self._bodies[i]])
+        chosen = np.unique(pairs).tolist()
+        surfaces = [self._surfaces[i] for i in chosen]
+        moved = gather_each(surfaces, [u[self._bodies[i]] for i in chosen])
+        for i, surface, way in zip(chosen, surfaces, moved, strict=True):
+            x = surface.reference + way
             boxes[i] = range_of(x)
             sizes[i] = facets.size(x[surface.facets]).max(initial=0.0)
         one, two = boxes[pairs].swapaxes(0, 1)

@@ -17,7 +17,7 @@ from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import entries_of, over
 from dolfinx_nts.kernels import compiled_law, nts_element
 from dolfinx_nts.kernels.vectors import resultant
-from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -39,6 +39,8 @@ class ContactElements(Batch):
         measure: Their gap and slip.
         law: What these obey.
         offset: Gap that counts as none [m], shape (n,), see `ContactPair`.
+        contacts: Extents [m] of several contacts whose elements these are, and number of that of
+            each element, shape (n,); None: they are of one.
     """
 
     pair: ContactPair
@@ -47,6 +49,7 @@ class ContactElements(Batch):
     measure: ContactMeasure
     law: ContactLaw
     offset: FloatArray | float = 0.0
+    contacts: tuple[FloatArray, IntArray] | None = None
     combination: ClassVar[Combination | None] = None
 
     def select(self, chosen: BoolArray) -> ContactElements:
@@ -233,8 +236,8 @@ class ContactElements(Batch):
         """What is left of the constraints of each slave [kg m], shape (n, constraints)."""
         return of_multipliers(self, self.rows(k, "constraints")).reshape(k.multiplier.shape)
 
-    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
-        """Residual and tangent of the pairs. Collective, and reached by all if an obstacle raises.
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Asking[Contribution]:
+        """Residual and tangent of the pairs, as of `together`; it asks, too, if an obstacle raises.
 
         Args:
             x: Nodes of slave and master at t_{n+1} [m], shape (n, k, 3).
@@ -247,7 +250,7 @@ class ContactElements(Batch):
         try:
             found = self.measure.evaluate(x, own["augmented"], multiplier)
         except Exception:  # any of an obstacle of the user's; the other ranks wait
-            self._together(np.empty(0), None, np.empty((0, 1)))
+            yield from self._together(np.empty(0), None, np.empty((0, 1)))
             raise
         gap = found.gap - self.offset + law.overlap
         found.residual[:, law.row], found = gap, found._replace(gap=gap)
@@ -255,7 +258,7 @@ class ContactElements(Batch):
         if slip:
             slip = slip._replace(value=slip.value + law.slid)
             found = found._replace(slip=slip)
-        together = self._together(gap, slip, multiplier)
+        together = yield from self._together(gap, slip, multiplier)
         obeyed = law.obey(x, found, multiplier, together)
         residual, tangent, weights = obeyed.residual, obeyed.tangent, self.attachment.weights
         if weights is not None:
@@ -271,20 +274,28 @@ class ContactElements(Batch):
 
     def _together(
         self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray
-    ) -> Together:
-        """Return what pairs that share nodes need to know of each other. Collective."""
+    ) -> Asking[Together]:
+        """Return what pairs that share nodes need to know of each other."""
         if not self.law.redundant:
-            return Together(0.0, 0.0, 0.0)
-        local = self.law.misses(gap, slip, multiplier)
-        ranks = gather_rows(self.pair.slave.body.comm, local[None])
-        total, number = ranks[:, :2].sum(axis=0)
-        lent = SHIFT + ranks[:, 2:].max(axis=0) / self.pair.extent
-        return Together(total / max(number, 1.0), *lent)
+            # Between two walls the gap to one says already that a node sticks to the other.
+            return Together(-multiplier[:, 0], 0.0, SHIFT * self.law.meets)
+        extents, of = self.contacts or (
+            np.array([self.pair.extent]), np.zeros(len(gap), dtype=np.int64)
+        )
+        of = of[: len(gap)]
+        local = self.law.misses(gap, slip, multiplier, of, len(extents))
+        sums, largest = yield local[:, :2], local[:, 2:]
+        total, number = sums.reshape(-1, 2).T
+        lent = SHIFT + largest.reshape(-1, 2).T / extents
+        return Together(*np.array([total / np.maximum(number, 1.0), *lent])[:, of])
 
     # ---- what a step asks of elements once it is solved, or is not
     def largest(self, part: Contribution) -> list[float]:
         """Sizes that `ratios` compares: augmented rows, gaps, multipliers and scale."""
         gaps = self.law_rows(part) / self.law.scale[:, None]
+        if self.law.num_tangential:
+            friction = np.abs(gaps[:, -2:]) - self.law.unsure(part, _EPS * self.extent)[:, None]
+            gaps[:, -2:] = friction.clip(min=0.0)
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.law.scale)
         found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
         # Rows of gaps that repeat each other miss what no motion closes, see `shared_weight`.
@@ -298,12 +309,12 @@ class ContactElements(Batch):
 
         Args:
             part: Plays no part.
-            largest: `largest` over all ranks.
+            largest: `largest`; multipliers and scale over all ranks if there are augmented rows.
             motion: Largest motion of the step [m].
             rounded: Length whose rounding is in all positions [m].
             rtol: Tolerance of Newton's method.
         """
-        augmented, gap, force, scale = largest.tolist()
+        augmented, gap, force, scale = largest
         limit = rtol * motion + 8 * _EPS * (rounded + self.extent)
         found = {f"{self.name} constraints": over(gap, limit)}
         if self.measure.num_augmented:

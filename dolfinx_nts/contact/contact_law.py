@@ -6,7 +6,7 @@ into the elements' rows (theory sections 6 and 9); `contact_law.c` does that.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.contact.slip_friction import SlipFriction
 from dolfinx_nts.kernels import compiled_law
-from dolfinx_nts.types import BoolArray, FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Part of the slave's mass by which an open gap counts against a force. In each solution one of the
 #: two is zero, and any part will do; in a first guess forces of the last step go with gaps of free
@@ -64,8 +64,10 @@ class Rub(Enum):
 class Together(NamedTuple):
     """What all pairs of a contact have in common where they share nodes, as of rigid bodies.
 
-    The compliances are those that the matrix lends to what holds a pair, over that of the bodies;
-    they vanish with what is missed, see `constraints.SHIFT`, and are 0 where pairs share nothing.
+    Of several contacts the values of each pair are those of its contact, shape (n,). The
+    compliances are those that the matrix lends to what holds a pair, over that of the bodies;
+    they vanish with what is missed, see `constraints.SHIFT`, and are 0 where pairs share nothing;
+    that of sticking nodes that `meets` names is fixed.
 
     Attributes:
         force: Mean normal force [kg m].
@@ -73,9 +75,9 @@ class Together(NamedTuple):
         tangential: Compliance lent to sticking [-].
     """
 
-    force: float
-    normal: float
-    tangential: float
+    force: FloatArray | float
+    normal: FloatArray | float
+    tangential: FloatArray | float
 
 
 class Contribution(NamedTuple):
@@ -153,6 +155,9 @@ class ContactLaw(Batch):
         width: Slip [m] by which friction is blurred, see `blur_slip` in contact_law.c; 0: it is
             not.
         gap_width: The same of gaps, see `blur_gap`.
+        steep: Least algorithmic scale of the return map, shape (n,): the bound over the slip from
+            which on a pair slides.
+        meets: Which slaves another contact holds, too, shape (n,).
     """
 
     friction: float
@@ -174,6 +179,8 @@ class ContactLaw(Batch):
     varies: SlipFriction | None = None
     width: float = 0.0
     gap_width: float = 0.0
+    steep: FloatArray | float = 0.0
+    meets: BoolArray | bool = False
 
     # ---- multipliers
     @property
@@ -240,7 +247,13 @@ class ContactLaw(Batch):
         if self.rubs is Rub.SLIDES:
             # Whatever has slid is beyond the bound.
             return self.yielding / HARDLY
-        return (TANGENTIAL_SCALE if self.yields else _OF_SHARED) * self.yielding
+        scale = (TANGENTIAL_SCALE if self.yields else _OF_SHARED) * self.yielding
+        return np.maximum(scale, self.steep)
+
+    def held(self, active: BoolArray, *, stick: bool) -> ContactLaw:
+        """The same of pairs that are active as given, and stick, but for those that hardly rub."""
+        rubs = Rub.STICKS if stick and self.rubs is not Rub.HARDLY else self.rubs
+        return replace(self, imposed=active, rubs=rubs)
 
     @cached_property
     def massless(self) -> BoolArray:
@@ -251,22 +264,33 @@ class ContactLaw(Batch):
         return massless
 
     # ---- an iterate
-    def misses(self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
+    def misses(
+        self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray, of: IntArray, number: int
+    ) -> FloatArray:
         """Sum and number of the forces that press [kg m], largest gap of these and slip [m].
 
         The slip is that of pairs that are to stick: what others slip is not missed, and does not
         vanish in the solution.
+
+        Args:
+            gap: As of `Measured`.
+            slip: As of `Measured`.
+            multiplier: As of `obey`.
+            of: Contact of each pair, shape (n,).
+            number: Of contacts.
+
+        Returns:
+            Of each contact, shape (number, 4).
         """
-        force = multiplier[:, 0]
+        force, found = multiplier[:, 0], np.zeros((number, 4))
         on = (force < 0.0) | (gap < 0.0)
-        missed = 0.0
+        np.add.at(found[:, 0], of, -force.clip(max=0.0))
+        np.add.at(found[:, 1], of, force < 0.0)
+        np.maximum.at(found[:, 2], of[on], np.abs(gap[on]))
         if slip is not None:
             stick = on & ~self._slides(gap, slip, multiplier)
-            missed = np.abs(slip.value[stick]).max(initial=0.0)
-        return np.array([
-            -force[on].clip(max=0.0).sum(), np.count_nonzero(force[on] < 0.0),
-            np.abs(gap[on]).max(initial=0.0), missed,
-        ])  # fmt: skip
+            np.maximum.at(found[:, 3], of[stick], np.abs(slip.value[stick]).max(axis=1))
+        return found
 
     def _slides(self, gap: FloatArray, slip: Slip, multiplier: FloatArray) -> BoolArray:
         """Which pairs that share nodes are beyond Coulomb's bound, as the kernel has it."""
@@ -343,6 +367,18 @@ class ContactLaw(Batch):
         )  # fmt: skip
 
     # ---- a solution
+    def unsure(self, part: Contribution, rounding: float) -> FloatArray:
+        """What the rounding [m] of slips leaves unsure in the rows of friction [m], shape (n,).
+
+        Friction has the direction of the slip, however small that is: of a rigid body's nodes that
+        rub against each other by 1e-10 m rounding tells 1e-6 of it.
+        """
+        bound, scale = self.coefficient * -part.end[:, 0], self.tangential_scale
+        trial = bound + scale * part.distance
+        slides = part.active & ~part.stick & (trial > 0.0)
+        share = np.divide(scale * rounding, trial, out=np.zeros_like(bound), where=slides)
+        return np.asarray(bound * share / self.scale)
+
     def sticks(self, part: Contribution) -> BoolArray:
         """Which pairs have stuck in a solved step, shape (n,).
 

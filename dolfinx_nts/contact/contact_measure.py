@@ -33,6 +33,27 @@ class Batch:
                 changed[name] = value.select(chosen)
         return replace(self, **changed)
 
+    @classmethod
+    def joined(cls, batches: Sequence[Any], counts: Sequence[int]) -> Any:
+        """Those of several batches, one after the other, that differ in numbers and arrays alone.
+
+        Args:
+            batches: At least one, of the same class.
+            counts: How many elements each has.
+        """
+        changed: dict[str, Any] = {}
+        for name in cls.__dataclass_fields__:
+            values = [getattr(batch, name) for batch in batches]
+            if hasattr(values[0], "joined"):
+                changed[name] = values[0].joined(values, counts)
+            elif any(isinstance(v, np.ndarray) for v in values) or (
+                isinstance(values[0], float) and any(v != values[0] for v in values)
+            ):
+                rest = max((np.shape(v)[1:] for v in values), key=len)
+                rows = zip(values, counts, strict=True)
+                changed[name] = np.concatenate([np.broadcast_to(v, (n, *rest)) for v, n in rows])
+        return replace(batches[0], **changed)
+
 
 class Slip(NamedTuple):
     """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""

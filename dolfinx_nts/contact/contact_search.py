@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,11 +21,11 @@ from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
-from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before
+from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.parallel import Asking, anywhere, global_max, together
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
@@ -74,8 +75,10 @@ class ContactSearch:
         self._begun: State | None = None
         self._had: Sequence[BoolArray] | None = None
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
-        before = zip(contacts, held_before(contacts), strict=True)
-        self._foreign = [held[pair.slave.share] for pair, held in before]
+        shares, before = [pair.slave.share for pair in contacts], held_before(contacts)
+        self._foreign = [held[here] for held, here in zip(before, shares, strict=True)]
+        both = zip(meeting(contacts, before), shares, strict=True)
+        self._meets = [meets[here] for meets, here in both]
 
     @property
     def had_unknowns(self) -> list[BoolArray]:
@@ -128,19 +131,17 @@ class ContactSearch:
     def _seek(self) -> None:
         """Find candidates, and which of them need unknowns. Collective."""
         had, declared = self.had_unknowns, [k for k in self._sought if k < self._declared]
-        found: dict[int, Any] = {k: self._search(k) for k in declared}
-        found = {k: c for k, c in found.items() if c is not None}
+        found: dict[int, Any] = self._search(declared)
         drop_doubles(found, self._old)
-        slaves: dict[int, list[Any]] = {}
+        slaves: dict[int, list[ContactElements]] = {}
         for c in found.values():
-            slaves.setdefault(id(c.pair.slave.body), []).append((c.pair.slave, c.candidates))
-        for k in self._sought[len(declared) :]:
-            corners, of = self._corners[k - self._declared]
+            slaves.setdefault(id(c.pair.slave.body), []).append(c)
+        left, of_corners = [], self._sought[len(declared) :]
+        for corners, of in (self._corners[k - self._declared] for k in of_corners):
             meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=np.int64)
-            corners.leave_to(slaves.get(id(corners.master.body), []), meet)
-            near = self._search(k)
-            if near is not None:
-                found[k] = near
+            left.append(corners.leave_to(slaves.get(id(corners.master.body), []), meet))
+        together(self._comm, left)
+        found |= self._search(of_corners)
         self.numbers, self._found = list(found), list(found.values())
         self._apart.found(self.numbers)
         self.bodies = [self._of[k] for k in found]
@@ -152,11 +153,13 @@ class ContactSearch:
         both = list(zip(self._found, self._with_unknowns, strict=True))
         self.elements, self.idle = [c.select(a) for c, a in both], [c.select(~a) for c, a in both]
         self.idle_gaps = [np.empty(0) for _ in self.idle]
-        watching = any(len(c.candidates.node) for c in self.idle)
-        self._watching = anywhere(self._comm, watching)
 
-    def dives(self) -> bool:
-        """Whether free flight presses nodes deep into their masters. Collective."""
+    def watch(self) -> Asking[None]:
+        """Note whether any rank has idle candidates, after `begin` and `wake`, as of `together`."""
+        self._watching = yield any(len(c.candidates.node) for c in self.idle)
+
+    def dives(self) -> Asking[bool]:
+        """Whether free flight presses nodes deep into their masters, as of `together`."""
         limits = [
             _DEEP * np.minimum(c.candidates.length, c.pair.slave.smallest) for c in self.elements
         ]
@@ -164,10 +167,10 @@ class ContactSearch:
             self._reach(k, self._step.motion) > limit.min(initial=np.inf)
             for k, limit in zip(self.numbers, limits, strict=True)
         ]
-        if not anywhere(self._comm, any(far)):
+        if not (yield any(far)):
             return False
         both = zip(self.flight_gaps(), limits, strict=True)
-        return anywhere(self._comm, any((gap < -limit).any() for gap, limit in both))
+        return (yield any((gap < -limit).any() for gap, limit in both))
 
     def forget_solution(self) -> None:
         """Guess forces of t_n again, where those of a solution of this step led nowhere."""
@@ -184,8 +187,7 @@ class ContactSearch:
             # What corners touch lies where their pair's surfaces do.
             self._placed[k] = self._positions(self._corners[k - self._declared][1])[::-1]
         elif k not in self._placed:
-            u = [self._step.state.u[b] for b in self._of[k]]
-            self._placed[k] = self._pairs[k].positions(u)
+            self._placed[k] = self._pairs[k].positions([self._step.state.u[b] for b in self._of[k]])
         return self._placed[k]
 
     def _reach(self, k: int, motion: FloatArray) -> float:
@@ -193,7 +195,12 @@ class ContactSearch:
         reach = np.sqrt(3.0) * float(sum(motion[b] for b in self._of[k]))
         return reach + float(np.linalg.norm(np.diff(self._paths[k], axis=0)))
 
-    def _search(self, k: int) -> ContactElements | None:
+    def _search(self, numbers: Sequence[int]) -> dict[int, ContactElements]:
+        """Candidates of contacts that have some, on all ranks. Collective."""
+        found = together(self._comm, map(self._searched, numbers))
+        return {k: c for k, c in zip(numbers, found, strict=True) if c is not None}
+
+    def _searched(self, k: int) -> Asking[ContactElements | None]:
         """Candidates of a contact, found anew unless all its bodies slept and nothing moves.
 
         None: it has none.
@@ -201,35 +208,32 @@ class ContactSearch:
         u = [self._step.state.u[b] for b in self._of[k]]
         known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
         if reach > 0.0:
-            return self._find(k, reach)
+            return (yield from self._find(k, reach))
         # Overlap that is pressed out is another one in a load step of another length.
         ramp = self._step.integrator.ramp(self._step.state.time + self._step.dt)
-        same = known is not None and known[1] == ramp
-        if known is None or not same or any(a is not b for a, b in zip(known[0], u, strict=True)):
-            known = u, ramp, self._find(k, reach)
+        if known is None or known[1] != ramp or any(map(operator.is_not, known[0], u)):
+            known = u, ramp, (yield from self._find(k, reach))
         self._known[k] = known
         return known[2]
 
-    def _find(self, k: int, reach: float) -> ContactElements | None:
+    def _find(self, k: int, reach: float) -> Asking[ContactElements | None]:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self._of[k], self._step
         positions, ahead = self._positions(k), [step.ahead[b] for b in bodies]
-        rests = not step.integrator.inertia
-        found, self._followed[k], self._cover[k] = pair.find(
-            positions,
-            self._old[k].facet,
-            path,
-            Motion(reach, ahead, self._aimed[k], self._repeats > 0, rests),
-            # What load steps carry inside is looked for.
-            None if rests and k < self._declared else self._old[k].followed,
+        rests, old = not step.integrator.inertia, self._old[k]
+        motion = Motion(reach, ahead, self._aimed[k], self._repeats > 0, rests)
+        # What load steps carry inside is looked for.
+        followed = None if rests and k < self._declared else old.followed
+        found, self._followed[k], self._cover[k] = yield from pair.find(
+            positions, old.facet, path, motion, followed
         )
         mine, share = ~self._foreign[k][found.node], pair.slave.share
         if k in self._edges:
-            beyond = self._edges[k].find(positions, found, share[self._old[k].force > 0.0])
+            beyond = yield from self._edges[k].find(positions, found, share[old.force > 0.0])
             mine &= ~np.isin(share[found.node], beyond)
         found = found.select(mine)
-        if not anywhere(self._comm, len(found.node) > 0):
+        if not (yield len(found.node) > 0):
             return None
-        overlap, start = self._old[k].overlap[found.node], step.state.time
+        overlap, start = old.overlap[found.node], step.state.time
         ramp = step.integrator.ramp
         found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
         elements: ContactElements = pair.elements(found, positions, path, step)
@@ -241,7 +245,7 @@ class ContactSearch:
         force = step.force_rounding(bodies) if pair.friction else 0.0
         law = replace(
             elements.law, overlap=(1.0 - ramp(start + step.dt)) * overlap, rounding=_TOUCH * gap,
-            force_rounding=_TOUCH * force,
+            force_rounding=_TOUCH * force, meets=self._meets[k][found.node],
         )  # fmt: skip
         if pair.friction and not step.dt:
             # A load step is relaxed in several solutions, and friction knows of all of them.
@@ -251,7 +255,7 @@ class ContactSearch:
             law = replace(law, slid=slid)
         massless = self._massless[k][found.node]
         if step.integrator.inertia and massless.any():
-            before = step.factor * elements.carried(self._old[k])
+            before = step.factor * elements.carried(old)
             before[~massless] = np.nan
             law = replace(law, before=before)
         return replace(elements, law=law, offset=pair.offset[found.node] if pair.adjust else 0.0)
@@ -299,7 +303,7 @@ class ContactSearch:
             StepFailedError: A node went through an obstacle and out of it again.
         """
         batches = dict(zip(self.numbers, range(len(parts)), strict=True))
-        missed = self._apart.misses(motion)
+        missed, passed = self._apart.misses(motion), list[Asking[bool]]()
         for k in self._sought:
             reach = self._reach(k, motion)
             missed |= reach > self._cover[k]
@@ -307,7 +311,8 @@ class ContactSearch:
             if k in batches:
                 c, active = self.elements[batches[k]].candidates, parts[batches[k]].active
                 held[c.node[active]] = c.facet[active]
-            missed |= self._passed(k, e, held, reach)
+            passed.append(self._passed(k, e, held, reach))
+        missed |= any(together(self._comm, passed))
         stale = not missed and self._are_stale(e, parts)
         self._repeats = self._repeats + 1 if stale else 0
         return missed or stale
@@ -334,12 +339,12 @@ class ContactSearch:
             far.append(c.pair.strayed(end, c.candidates.select(on), due))
         return float(global_max(self._comm, np.array(far)).max())
 
-    def _passed(self, k: int, e: Evaluation, held: IntArray, reach: float) -> bool:
-        """Return whether nodes have come through facets unseen, which are noted. Collective."""
+    def _passed(self, k: int, e: Evaluation, held: IntArray, reach: float) -> Asking[bool]:
+        """Return whether nodes have come through facets unseen, which are noted."""
         pair, bodies, path = self._pairs[k], self._of[k], self._paths[k]
         motions, positions = [e.bodies[b].du for b in bodies], self._positions(k)
         try:
-            hit = pair.missed(positions, motions, path, reach, held, self._aimed[k])
+            hit = yield from pair.missed(positions, motions, path, reach, held, self._aimed[k])
         except UserFunctionError:
             raise
         except StepFailedError as failure:
@@ -353,7 +358,7 @@ class ContactSearch:
         # What is held at a facet that its path led to is to be so again.
         at = np.where(self._aimed[k] >= 0, held, -1)
         self._aimed[k] = np.where(new | (at < 0), self._aimed[k], at)
-        return anywhere(self._comm, bool(new.any()))
+        return (yield bool(new.any()))
 
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""
@@ -419,13 +424,10 @@ class ContactSearch:
 
         Args:
             active: Of each of `elements`, shape (n,).
-            stick: Let the active ones stick, too.
+            stick: Let the active ones stick, too, but for those that hardly rub.
         """
-        by_law = self.elements
-        self.elements = [
-            replace(c, law=replace(c.law, imposed=on, rubs=Rub.STICKS if stick else c.law.rubs))
-            for c, on in zip(by_law, active, strict=True)
-        ]
+        by_law, both = self.elements, zip(self.elements, active, strict=True)
+        self.elements = [replace(c, law=c.law.held(on, stick=stick)) for c, on in both]
         try:
             yield
         finally:

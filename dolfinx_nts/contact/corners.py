@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import OUTSIDE
 from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.facet_pair import FacetPair
-from dolfinx_nts.contact.pair import Candidates, Found, Motion
+from dolfinx_nts.contact.pair import Found, Motion
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import compiled, facets
-from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.parallel import Asking, global_sum
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -32,7 +33,7 @@ class Corners(FacetPair):
     """The master's corners of a pair against the facets of its slave.
 
     Those that something else holds are none of its candidates: where faces lie on each other the
-    slave's nodes do, beside edges that meet these edges.
+    slave's nodes do, and of bodies that bend edges that meet these edges beside them.
 
     Args:
         of: The pair, whose options it has.
@@ -63,22 +64,27 @@ class Corners(FacetPair):
         """Sum of the forces that they bear [N]. Collective."""
         return float(global_sum(self.slave.body.comm, history.force.sum(keepdims=True))[0])
 
-    def leave_to(self, nodes: Sequence[tuple[Surface, Candidates]], meet: IntArray) -> None:
-        """Note what else holds in a step, before `find`. Collective.
+    def leave_to(
+        self, nodes: Sequence[ContactElements], meet: IntArray
+    ) -> Asking[None]:
+        """Note what else holds in a step, before `find`, as of `together`.
 
         Args:
-            nodes: Candidates among this rank's slaves of the contacts in which the body is a slave,
-                whatever their masters, with their surfaces.
+            nodes: Those of the contacts in which the body is a slave. What holds nodes of rigid
+                bodies elsewhere may leave with them.
             meet: Ends of edges that may meet, two points of the master and two of the slave,
                 shape (k, 4).
         """
         at, self._meet = self.master.points, meet
         # From all points of the body that is the slave to where they touch what may hold them.
         self._ways, self._near = np.zeros((len(at), 3)), np.zeros(len(at), dtype=bool)
-        for surface, c in nodes:
+        for elements in nodes:
+            if not self.yields and self.slave.body not in elements.pair.bodies:
+                continue
+            surface, c = elements.pair.slave, elements.candidates
             ways = np.zeros((len(surface.share), 4))
             ways[c.node, :3], ways[c.node, 3] = -c.gap[:, None] * c.normal, 1.0
-            ways, points = surface.at_all(ways), surface.points
+            ways, points = (yield from surface.spread(ways)), surface.points
             if points is not at:
                 _, own, other = np.intersect1d(at, points, return_indices=True)
                 found, ways = ways[other], np.zeros((len(at), 4))
@@ -98,6 +104,31 @@ class Corners(FacetPair):
         self._asked = found.facet
         return found
 
+    def _heights(
+        self, point: IntArray, k: IntArray, x: FloatArray, normal: FloatArray
+    ) -> FloatArray:
+        """How high over corners (n,) edges that end there meet edges of facets [m], shape (n,).
+
+        Args:
+            point: The corners, shape (n,).
+            k: Numbers of what meets, see `leave_to`, shape (n,).
+            x: Points of the slave [m].
+            normal: Of the facets, shape (n, 3).
+        """
+        ends = self._meet[k]
+        far = np.where(ends[:, 0] == point, ends[:, 1], ends[:, 0])
+        along, (start, end) = x[far] - x[point], self._masters[ends[:, 2:]].transpose(1, 0, 2)
+        across, way = end - start, x[point] - start
+        (aa, bb, ab), (left, right) = (
+            [np.einsum("ni,ni->n", a, b) for a, b in both]
+            for both in (((along, along), (across, across), (along, across)),
+                         ((along, way), (across, way)))
+        )  # fmt: skip
+        square = aa * bb - ab**2
+        part = np.divide(ab * right - bb * left, square, out=np.ones_like(aa), where=square > 0.0)
+        height: FloatArray = np.clip(part, 0.0, 1.0) * np.einsum("ni,ni->n", normal, along)
+        return height
+
     def find(
         self,
         positions: Sequence[FloatArray],
@@ -105,9 +136,10 @@ class Corners(FacetPair):
         path: FloatArray,
         motion: Motion | None = None,
         followed: BoolArray | None = None,
-    ) -> Found:
-        """As of `ContactPair`, but for those that something else holds. Collective."""
-        found = super().find(positions, current, path, motion, followed)
+    ) -> Asking[Found]:
+        """As of `ContactPair`, but for those that something else holds."""
+        self._masters = positions[1]
+        found = yield from super().find(positions, current, path, motion, followed)
         c = found.candidates
         if not len(c.node):
             return found
@@ -129,9 +161,9 @@ class Corners(FacetPair):
         reach: float,
         held: IntArray,
         aimed: IntArray,
-    ) -> IntArray | None:
+    ) -> Asking[IntArray | None]:
         """Do as `ContactPair`, but for those that something else holds."""
-        hit = super().missed(positions, motions, path, reach, held, aimed)
+        hit = yield from super().missed(positions, motions, path, reach, held, aimed)
         if hit is not None:
             node, corners = np.flatnonzero(hit >= 0), positions[1][self.master.facets]
             hit[node[self._held(node, hit[node], positions[0], corners)]] = -1
@@ -143,8 +175,10 @@ class Corners(FacetPair):
         """Which of this rank's corners over facets something else holds, shape (n,).
 
         Those that stay as good as outside while corners of their facets are where the slave's nodes
-        hold them, on what these may touch, or at edges that meet those of the corner, and the
-        others anywhere within a facet's size.
+        hold them, on what these may touch, or, of bodies that bend, where their edges meet those of
+        the corner, and the others anywhere within a facet's size. A corner that points at a facet
+        is ahead of these edges, and they do not hold it. Nor do they hold one that is rigid: that
+        turns about the line between two of them.
 
         Args:
             node: The corners, shape (n,).
@@ -159,12 +193,15 @@ class Corners(FacetPair):
         weights, _, _ = facets.shape(xi, at.shape[1])
         _, _, normal = facets.frame(corners, xi)
         rise = np.einsum("ni,nki->nk", normal, corners + self._ways[at] - x[point][:, None])
-        rise /= facets.size(corners)[:, None]
+        size = facets.size(corners)
+        rise /= size[:, None]
         depth = np.where(self._near[at], np.clip(rise, 0.0, 1.0), 1.0)
-        if len(self._meet):
+        if self.yields and len(self._meet):
             own, k = np.nonzero((point[:, None, None] == self._meet[None, :, :2]).any(axis=2))
             meets = (at[own][:, :, None] == self._meet[k, None, 2:]).any(axis=2)
-            np.minimum.at(depth, own, np.where(meets, 0.0, 1.0))
+            if own.size:
+                height = self._heights(point[own], k, x, normal[own]) / size[own]
+                np.minimum.at(depth, own, np.where(meets, np.clip(height, 0.0, 1.0)[:, None], 1.0))
         outside = _OUTSIDE if self.yields else _FLUSH
         held: BoolArray = np.einsum("nk,nk->n", weights, depth) < outside
         return held

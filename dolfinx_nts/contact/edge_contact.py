@@ -16,7 +16,7 @@ import numpy as np
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_measure import Batch
 from dolfinx_nts.contact.edges import SHARES, Edges, within
-from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import global_sum
@@ -156,8 +156,8 @@ class EdgeContact:
         Args:
             u: Owned displacements of each body [m].
         """
-        both = zip(self.edges, self._references, u, strict=True)
-        slave, master = (start + edges.surface.gather(each) for edges, start, each in both)
+        moved = gather_each([edges.surface for edges in self.edges], u)
+        slave, master = (a + b for a, b in zip(self._references, moved, strict=True))
         return slave, master
 
     @cached_property

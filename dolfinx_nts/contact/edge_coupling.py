@@ -15,12 +15,13 @@ from dolfinx_nts.contact.edges import LEVEL, SHARES, Near, Pairs
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.pair import MARGIN, Candidates
+from dolfinx_nts.contact.surfaces import gather_each
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.kernels.vectors import relative_way
-from dolfinx_nts.parallel import anywhere, gather_rows, global_max
+from dolfinx_nts.parallel import Asking, anywhere, global_max, together
 from dolfinx_nts.state import EdgeHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -64,7 +65,7 @@ class EdgeCoupling:
         # since then at most, and how far they may move before others are near.
         self._pairs: Pairs | None = None
         # Of these the ones with elements, on this rank, and of all ranks in the step so far.
-        self._chosen, self._tried = _NONE, _NONE[:, 0]
+        self._chosen, self._tried, self._any = _NONE, _NONE[:, 0], False
         self._looked: Sequence[FloatArray] = ()
         self._way, self._clear = 0.0, 0.0
         # Where the boundaries' points were at the end of the last solution.
@@ -118,7 +119,7 @@ class EdgeCoupling:
     def leave(self) -> None:
         """Forget where edges are as the surfaces are far from each other."""
         self._looked, self._last, self._followed, self._pairs = (), (), False, None
-        self._chosen, self._tried, self._end = _NONE, _NONE[:, 0], None
+        self._chosen, self._tried, self._end, self._any = _NONE, _NONE[:, 0], None, False
         self.make()
 
     # ---- which of these may meet in a step
@@ -137,8 +138,8 @@ class EdgeCoupling:
 
     def find(
         self, places: Sequence[FloatArray], nodes: Candidates, pressed: IntArray
-    ) -> IntArray:
-        """Choose the pairs that may meet in a step. Collective.
+    ) -> Asking[IntArray]:
+        """Choose the pairs that may meet in a step, as of `together`.
 
         Args:
             places: Positions of all points of the pair's surfaces [m].
@@ -153,34 +154,37 @@ class EdgeCoupling:
         self._cover, self._nodes = reach + MARGIN * self.contact.size, nodes
         u = [step.state.u[b] for b in of]
         self._look(u, places)
-        self._chosen = _NONE
+        self._chosen, self._any = _NONE, False
         if self._pairs is None:
             return _NONE[:, 0]
-        self._x = self._positions(u)
+        self._x = yield from self._positions(u)
         # No motion bounds a load step.
         limit = near if step.integrator.inertia else self._cover
-        both = zip(self.contact.edges, of, strict=True)
-        ways = [edges.surface.gather(step.ahead[b]) for edges, b in both]
+        boundaries = [edges.surface for edges in self.contact.edges]
+        ways = gather_each(boundaries, [step.ahead[b] for b in of])
         found = self._pairs.closest(self._x, ways, reach + near, near, limit)
-        old = gather_rows(self._comm, self._history.pair)
-        held = self.contact.pair.slave.share[nodes.node]
-        let_go = gather_rows(self._comm, np.setdiff1d(pressed, held))
+        gone = np.setdiff1d(pressed, self.contact.pair.slave.share[nodes.node])
+        gone = np.column_stack([gone, np.full_like(gone, -1)])
+        rows = yield np.concatenate([self._history.pair, gone])
+        old, let_go = rows[rows[:, 1] >= 0], rows[rows[:, 1] < 0, 0]
         some = len(old) or len(let_go) or len(self._tried) or found.some[0]
         some = some or step.state.time == self._start
         if not some and self.contact.pair.holds_nodes:
             return _NONE[:, 0]
-        pairs, chosen = self._pairs.numbers, self._choose(found, old, let_go, reach, limit)
+        pairs = self._pairs.numbers
+        chosen = yield from self._choose(found, old, let_go, reach, limit)
         out = np.flatnonzero(chosen & (found.beyond > 0))
         mine = np.flatnonzero(chosen & self.contact.mine[pairs[:, 0]])
         self._chosen, self._gap = pairs[mine], found.gap[mine, 0]
         self._turned = found.turned[mine]
+        self._any = yield len(mine) > 0
         beyond: IntArray = self.contact.ends[0][pairs[out, 0], found.beyond[out] - 1]
         return beyond
 
     def _choose(
         self, found: Near, old: IntArray, let_go: IntArray, reach: float, limit: float
-    ) -> BoolArray:
-        """Which of the pairs that are near may press, shape (n,). Collective.
+    ) -> Asking[BoolArray]:
+        """Which of the pairs that are near may press, shape (n,), as of `together`.
 
         Args:
             found: Where they meet.
@@ -209,7 +213,7 @@ class EdgeCoupling:
         # Where no node is held, edges that press pass a rim on, one after the other.
         passed = (carries & (found.node == 1)) if holds else chosen & (carries | follows)
         left = chosen & ((found.node == 0) | (found.node >= _ASKED)) & ~(passed & (not holds))
-        self._leave_to_nodes(found, left)
+        yield from self._leave_to_nodes(found, left)
         chosen &= left | passed
         if not holds:
             self._take_one_at_nodes(found, chosen)
@@ -237,8 +241,8 @@ class EdgeCoupling:
         """Distance that counts as none [m]."""
         return _NEAR * self.contact.size
 
-    def _leave_to_nodes(self, found: Near, chosen: BoolArray) -> None:
-        """Take from chosen pairs those beside nodes that are candidates. Collective.
+    def _leave_to_nodes(self, found: Near, chosen: BoolArray) -> Asking[None]:
+        """Take from chosen pairs those beside nodes that are candidates, as of `together`.
 
         These touch a facet that the slave's edge is level with, a little beyond its rim, as where
         flat faces lie on each other, or flight would press them in.
@@ -251,7 +255,8 @@ class EdgeCoupling:
         slave, own = self.contact.pair.slave, self._pairs.numbers[some, 0]
         normals = np.zeros((len(slave.share), 3))
         normals[self._nodes.node] = self._nodes.normal
-        normal = slave.at_all(normals)[self.contact.ends[0][own, found.node[some] - _ASKED]]
+        normals = yield from slave.spread(normals)
+        normal = normals[self.contact.ends[0][own, found.node[some] - _ASKED]]
         start, end = self._x[0][self.contact.edges[0].ends[own]].transpose(1, 0, 2)
         rise = np.abs(np.einsum("ni,ni->n", normal, end - start))
         level = rise < LEVEL * np.linalg.norm(end - start, axis=1)
@@ -296,15 +301,15 @@ class EdgeCoupling:
         _, first = np.unique(np.column_stack([own, at]), axis=0, return_index=True)
         chosen[np.delete(some, first)] = False
 
-    def _positions(self, u: Sequence[FloatArray]) -> Sequence[FloatArray]:
-        """Positions of all points of both boundaries at t_n [m]. Collective.
+    def _positions(self, u: Sequence[FloatArray]) -> Asking[Sequence[FloatArray]]:
+        """Positions of all points of both boundaries at t_n [m], as of `together`.
 
         Mostly the last solution ends there.
         """
         end, self._end = self._end, None
         if end is not None:
             moved = not all(np.array_equal(a, b) for a, b in zip(u, end[0], strict=True))
-            if not anywhere(self._comm, moved):
+            if not (yield moved):
                 return end[1]
         return self.contact.positions(u)
 
@@ -328,8 +333,7 @@ class EdgeCoupling:
     # ---- elements of a step
     def make(self) -> None:
         """Make the elements of the pairs that `find` has chosen. Collective."""
-        some = self._pairs is not None and anywhere(self._comm, len(self._chosen) > 0)
-        self.elements = [self._made()] if some else []
+        self.elements = [self._made()] if self._any else []
         self.bodies = [self._of] * len(self.elements)
 
     def _made(self) -> EdgeElements:
@@ -385,15 +389,15 @@ class EdgeCoupling:
             return True
         if self._pairs is None:
             return False
-        u = [e.bodies[b].u1.copy() for b in self._of]
-        self._end, near = (u, self.contact.positions(u)), self._near
+        u = [e.bodies[b].u1 for b in self._of]
+        self._end, near = ([each.copy() for each in u], self.contact.positions(u)), self._near
         ways = [end - x for end, x in zip(self._end[1], self._x, strict=True)]
         found = self._pairs.closest(self._x, ways, reach + near, near)
         # So far the same on all ranks.
         if not found.some[1]:
             return False
         through = found.through & ((found.node == 0) | (found.node >= _ASKED))
-        self._leave_to_nodes(found, through)
+        together(self._comm, [self._leave_to_nodes(found, through)])
         pairs = self._pairs.numbers
         through &= self.contact.mine[pairs[:, 0]]
         through &= ~np.isin(self._key(pairs), self._key(self._chosen))

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dolfinx_nts.contact.convex_edges import SHARP
-from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import library, patches
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -45,7 +44,7 @@ class Edges:
         goes_on: From which ends another of the edges goes straight on, shape (n, 2).
     """
 
-    surface: Surface
+    surface: Any
     ends: IntArray
     corners: IntArray
     inside: BoolArray
@@ -143,11 +142,11 @@ class Pairs:
         return self._near
 
 
-def sharp_edges(surface: Surface, of: Surface) -> Edges:
+def sharp_edges(surface: Any, of: Any) -> Edges:
     """Edges of a reference at which two facets meet, sharp and convex.
 
     Args:
-        surface: The whole boundary of a body.
+        surface: The whole boundary of a body, a `Surface`.
         of: A part of it: one of the facets at least is to be in there.
     """
     # The others have no edge in common with the part.

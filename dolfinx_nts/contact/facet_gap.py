@@ -12,8 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
+from dolfinx_nts.contact.surface_sums import Sums
 from dolfinx_nts.kernels import compiled, facets, nts_element
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,8 +68,10 @@ class FacetGap(Batch):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of points at t_{n+1}, shape (n,)."""
-        foot, _, normal = facets.frame(x[:, 1:], self.projection(x))
-        return np.einsum("ni,ni->n", x[:, 0] - foot, normal)
+        xi = self.projection(x)
+        foot, _, normal = facets.frame(x[:, 1:], xi)
+        gap = np.einsum("ni,ni->n", x[:, 0] - foot, normal)
+        return np.where(facets.turned_over(x[:, 1:], xi), np.abs(gap), gap)
 
     def projection(self, x: FloatArray) -> FloatArray:
         """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
@@ -91,17 +94,41 @@ class FacetGap(Batch):
 
     def evaluate(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Measured:
         """Residual and tangent; `augmented` as of `augmented`."""
+        xi = self.projection(x)
         if self.rule == "direct":
-            found = self._direct(x, multiplier)
+            found = self._direct(x, xi, multiplier)
         elif not self.condense:
             found = self._invariants(x, augmented, multiplier)
         elif self.rule == "mean-value":
-            found = self._compiled(x, multiplier)
+            found = self._compiled(x, xi, multiplier)
         else:
             found = self._condensed(x, multiplier)
+        away = facets.turned_over(x[:, 1:], xi)
+        if away.any():
+            gap = np.where(away, np.abs(found.gap), found.gap)
+            found = found._replace(gap=gap, let_go=away)
         if found.slip is None:
             return found
         return found._replace(normal=self.normal_between(x))
+
+    def summed(
+        self, x: FloatArray, sums: Sums, multiplier: FloatArray, frame: FloatArray
+    ) -> compiled.OverSurface:
+        """What points contribute to slaves that carry so much, as of `ObstacleGap`."""
+        xi, given = self.projection(x), None
+        if self.rule != "mean-value":
+            own = sums.carried(multiplier, frame, self.middle_tangents(x, xi))
+            found = self.evaluate(x, np.empty((len(x), 0)), own)
+            slip = found.slip.gradient if found.slip else np.empty(0)
+            given = found.residual, found.tangent, slip
+        start = self.start, self.normal, self.xi, self.length
+        how = sums.how(multiplier, frame)
+        return compiled.over_surface(start, (x, xi), self.theta, how, given)
+
+    def has_strayed(self, x: FloatArray, cut: FloatArray, limit: float) -> BoolArray:
+        """Which points lie elsewhere over their facets than at coordinates (n, 2), by a limit."""
+        far: BoolArray = np.abs(self.projection(x) - cut).max(axis=1) > limit
+        return far
 
     def middle_tangents(self, x: FloatArray, xi: FloatArray) -> FloatArray:
         """Tangents a_a over the facet's size, where between t_n and t_{n+1} friction acts [-].
@@ -125,11 +152,11 @@ class FacetGap(Batch):
     def _has_friction(self, multiplier: FloatArray) -> bool:
         return multiplier.shape[1] > self.num_normal
 
-    def _direct(self, x: FloatArray, multiplier: FloatArray) -> Measured:
-        """`evaluate` of (x, multipliers)."""
+    def _direct(self, x: FloatArray, xi_end: FloatArray, multiplier: FloatArray) -> Measured:
+        """`evaluate` of (x, multipliers), with the projection."""
         n, size, theta = len(x), 3 * x.shape[1], self.theta
         middle = self.start + theta * (x - self.start)
-        xi_middle, xi_end = self.projection(middle), self.projection(x)
+        xi_middle = self.projection(middle)
         force, end = nts_element.gap(middle, xi_middle), nts_element.gap(x, xi_end)
         gradient = force.gradient.reshape(n, size)
         residual = np.zeros((n, size + multiplier.shape[1]))
@@ -220,9 +247,8 @@ class FacetGap(Batch):
         slip = self._slip(augmented[:, 3:] - length * self.xi, gradient, metric, metric_gradient)
         return Measured(residual, tangent, e.constraint[:, 0], slip)
 
-    def _compiled(self, x: FloatArray, multiplier: FloatArray) -> Measured:
-        """`_condensed` of the mean value."""
-        xi = self.projection(x)
+    def _compiled(self, x: FloatArray, xi: FloatArray, multiplier: FloatArray) -> Measured:
+        """`_condensed` of the mean value, with the projection."""
         k = compiled.condensed(
             self.start, x, self.normal, self.xi, xi, self.length, multiplier
         )

@@ -10,8 +10,8 @@ import numpy as np
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.contact.convex_edges import OUTSIDE, ConvexEdges, middles
-from dolfinx_nts.contact.edges import Edges, sharp_edges
+from dolfinx_nts.contact.convex_edges import OUTSIDE, middles
+from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facing import Facing
 from dolfinx_nts.contact.making import elements_of
@@ -30,7 +30,7 @@ from dolfinx_nts.contact.slave_paths import SlavePaths
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets
-from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
@@ -60,7 +60,7 @@ class FacetPair(ContactPair, master=Surface):
         self._check_surfaces()
         self.extent = max(self.extent, master.material.extent(self.origin))
         self._free_edges = master.boundary_edges
-        self.convex = ConvexEdges(master.facets, master.reference[master.facets])
+        self.convex = master.convex
         self.facing = Facing(self.slave, master, self.convex)
         self.cones = NormalCones(self)
         self.slave_paths = SlavePaths(self)
@@ -81,11 +81,10 @@ class FacetPair(ContactPair, master=Surface):
         meshes = [body.mesh for body in self.bodies]
         return self.edges and all(m is not None and m.topology.dim == 3 for m in meshes)
 
-    @cached_property
+    @property
     def sharp_edges(self) -> tuple[Edges, Edges]:
         """Sharp edges of the slave's and of the master's body in the surfaces. Collective."""
-        slave, master = (sharp_edges(s.body.boundary(), s) for s in self.surfaces)
-        return slave, master
+        return self.slave.sharp_edges, self.master.sharp_edges
 
     @cached_property
     def rims(self) -> Rims:
@@ -152,8 +151,7 @@ class FacetPair(ContactPair, master=Surface):
 
     def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
         """Positions of all points of both surfaces [m], (p, 3) each, as of `ContactPair`."""
-        both = zip((self.slave, self.master), u, strict=True)
-        return tuple(self._moved(surface, each) for surface, each in both)
+        return self._moved((self.slave, self.master), u)
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
@@ -167,8 +165,8 @@ class FacetPair(ContactPair, master=Surface):
         path: FloatArray,
         motion: Motion | None = None,
         followed: BoolArray | None = None,
-    ) -> Found:
-        """Search for this rank's candidates, as of `ContactPair`. Collective."""
+    ) -> Asking[Found]:
+        """Search for this rank's candidates, as of `ContactPair`."""
         self.slave_paths.forget()
         reach = self.lift + (0.0 if motion is None else motion.reach)
         every = np.ones(len(self.slave.share), dtype=bool)
@@ -185,13 +183,14 @@ class FacetPair(ContactPair, master=Surface):
         self.facing.look(slaves, corners)
         closest = self._closest(slaves, corners, radius, current)
         node = np.flatnonzero(closest.facet >= 0)
-        if not (self.is_long(reach) or anywhere(self.slave.body.comm, node.size > 0)):
+        if not (self.is_long(reach) or (yield node.size > 0)):
             return Found(NO_CANDIDATES, ~every, cover)
         found, lost = self.measure(x, master, node, closest.facet[node], closest.xi[node], reach)
         let_go = lost
         if motion is not None:
             near = found.node
-            found = self.slave_paths.lead(found, slaves, master, motion._replace(reach=reach))
+            near_by = motion._replace(reach=reach)
+            found = yield from self.slave_paths.lead(found, slaves, master, near_by)
             let_go = np.concatenate([lost, np.setdiff1d(near, found.node)])
         beside = (found.gap < -OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
@@ -280,8 +279,8 @@ class FacetPair(ContactPair, master=Surface):
         reach: float,
         held: IntArray,
         aimed: IntArray,
-    ) -> IntArray | None:
-        """Do as `ContactPair`. Collective."""
+    ) -> Asking[IntArray | None]:
+        """Do as `ContactPair`."""
         return self.slave_paths.missed(positions, motions, reach, held, aimed)
 
     def strayed(
@@ -307,7 +306,8 @@ class FacetPair(ContactPair, master=Surface):
         foot, _, normal = facets.frame(control, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
         length = facets.size(master[self.master.facets[facet]])
-        legal = converged & self._movable(node, patch, xi, -gap / length)
+        legal = converged & ~facets.turned_over(control, xi)
+        legal &= self._movable(node, patch, xi, -gap / length)
         beyond = np.zeros_like(legal)
         if reach is not None:
             over, beyond = self._over_facet(node, facet, xi, reach / length)

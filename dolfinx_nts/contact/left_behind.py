@@ -21,13 +21,15 @@ def unheld(
     comm: MPI.Comm, elements: Sequence[ContactElements], parts: Sequence[Contribution]
 ) -> Iterator[StepWarning]:
     """Nodes behind their facets whose forces would be rounding of other forces. Collective."""
+    # Without friction no force counts as rounding.
+    rub = [(c, part) for c, part in zip(elements, parts, strict=True) if c.pair.friction]
+    if not rub:
+        return
     depths = [
-        (-part.gap / c.candidates.length)[~part.active].max(initial=0.0)
-        for c, part in zip(elements, parts, strict=True)
+        (-part.gap / c.candidates.length)[~part.active].max(initial=0.0) for c, part in rub
     ]
-    for c, depth in zip(elements, global_max(comm, np.array(depths)), strict=True):
-        # Without friction no force counts as rounding.
-        if c.pair.friction and depth > _UNHELD:
+    for (c, _), depth in zip(rub, global_max(comm, np.array(depths)), strict=True):
+        if depth > _UNHELD:
             text = (
                 f"nodes of contact {c.pair.name!r} lie up to {depth:.3g} of a facet behind their "
                 "master without contact: a force that holds them is below the rounding of the "

@@ -16,13 +16,18 @@ from dolfinx_nts.kernels import facets
 from dolfinx_nts.types import FloatArray
 
 
-def carried_areas(surface: Any) -> FloatArray:
-    """Area whose uniform pressure is the force at each point of a `Surface` [m^2], (p,)."""
+def carried_areas(surface: Any, x: FloatArray) -> FloatArray:
+    """Area whose uniform pressure is the force at each point of a `Surface` [m^2], (p,).
+
+    Args:
+        surface: The surface.
+        x: Where its points are [m], shape (p, 3).
+    """
+    corners = x[surface.facets]
     if surface.faces is None:
-        tributary: FloatArray = surface.area
-        return tributary
-    each = facets.areas(surface.reference[surface.facets])[:, None] * surface.faces.parts
-    found = np.zeros(len(surface.points))
+        return facets.tributary_areas(surface.facets, corners, len(x))
+    each = facets.areas(corners)[:, None] * surface.faces.parts
+    found = np.zeros(len(x))
     np.add.at(found, surface.facets, each)
     return found
 

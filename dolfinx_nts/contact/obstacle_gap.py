@@ -13,9 +13,10 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.contact.obstacles import Obstacle, inverse
-from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.contact.surface_sums import Sums
+from dolfinx_nts.kernels import compiled, compiled_law
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,8 +69,48 @@ class ObstacleGap(Batch):
         """None."""
         return np.empty((len(x), 0))
 
+    def normal_at(self, x: FloatArray) -> FloatArray:
+        """Unit normals at points at t_{n+1}, shape (n, 3)."""
+        normal = np.asarray(self.obstacle.gap(x[:, 0]).gradient[:, 0], dtype=np.float64)
+        normal = normal * inverse(np.linalg.norm(normal, axis=1))[:, None]
+        return np.broadcast_to(normal, (len(x), 3))
+
+    def normal_between(self, x: FloatArray) -> FloatArray:
+        """Unit normals where between t_n and t_{n+1} the contact force acts, shape (n, 3)."""
+        return self.normal_at(self.start + self.theta * (x - self.start))
+
+    def has_strayed(self, x: FloatArray, cut: FloatArray, limit: float) -> BoolArray:
+        """Which points have been cut elsewhere, shape (n,): none is cut."""
+        return np.zeros(len(x), dtype=bool)
+
+    def summed(
+        self, x: FloatArray, sums: Sums, multiplier: FloatArray, frame: FloatArray
+    ) -> compiled.OverSurface:
+        """What points contribute to slaves, whose law is about sums of gaps and slips.
+
+        Args:
+            x: Points at t_{n+1} [m], shape (n, 1, 3).
+            sums: How.
+            multiplier: Of the slaves [kg m], shape (slaves, constraints).
+            frame: Directions of their slips, shape (slaves, 2, 3).
+        """
+        own = sums.carried(multiplier, frame, self.tangents)
+        given, _ = self._elements(x, own)
+        return compiled.over_obstacle(self.tangents, given, sums.how(multiplier, frame))
+
     def evaluate(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Measured:
         """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
+        (residual, tangent, *slip), middle = self._elements(x, multiplier)
+        gap = residual[:, 3].copy()
+        if not slip:
+            return Measured(residual, tangent, gap)
+        normal = np.asarray(middle, dtype=np.float64)
+        return Measured(residual, tangent, gap, Slip(*slip), np.broadcast_to(normal, (len(x), 3)))
+
+    def _elements(
+        self, x: FloatArray, multiplier: FloatArray
+    ) -> tuple[list[FloatArray], FloatArray]:
+        """What `compiled_law.obstacle` gives, and normals (n, 3) where friction acts."""
         master, end, direct = self.obstacle, self.obstacle.gap(x[:, 0]), self.rule == "direct"
         # Without friction nothing but the direct rule asks for the middle.
         middle = end
@@ -79,13 +120,9 @@ class ObstacleGap(Batch):
             rule = middle.gradient[:, 0], self.theta * middle.hessian
         else:
             rule = master.discrete_gradient(self.start[:, 0], x[:, 0])
-        residual, tangent, *slip = compiled_law.obstacle(
+        found: list[FloatArray] = compiled_law.obstacle(
             self.theta, rule, (end.value, end.gradient[:, 0]),
             (middle.gradient[:, 0], middle.hessian),
             self.normal, self.tangents, (x - self.start)[:, 0], multiplier,
         )  # fmt: skip
-        gap = residual[:, 3].copy()
-        if not slip:
-            return Measured(residual, tangent, gap)
-        normal = np.asarray(middle.gradient[:, 0], dtype=np.float64)
-        return Measured(residual, tangent, gap, Slip(*slip), np.broadcast_to(normal, (len(x), 3)))
+        return found, middle.gradient[:, 0]

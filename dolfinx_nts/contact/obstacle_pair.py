@@ -20,7 +20,7 @@ from dolfinx_nts.contact.pair import (
     Motion,
 )
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import Asking, global_max, together
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError
 
@@ -77,8 +77,9 @@ class ObstaclePair(ContactPair, master=Obstacle):
         path: FloatArray,
         motion: Motion | None = None,
         followed: BoolArray | None = None,
-    ) -> Found:
+    ) -> Asking[Found]:
         """Candidates, as of `ContactPair`. Nothing limits the depth: what is behind is inside."""
+        yield from ()
         slave, reach = self.slave, 0.0 if motion is None else motion.reach
         reach += self.lift
         x = positions[0][slave.share] - path[0]
@@ -95,7 +96,8 @@ class ObstaclePair(ContactPair, master=Obstacle):
     def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
         """As of `ContactPair`."""
         still = Motion(self.adjust, (), np.empty(0, dtype=np.int64))
-        return self.find(positions, still.aimed, path, still).candidates
+        (found,) = together(self.slave.body.comm, [self.find(positions, still.aimed, path, still)])
+        return found.candidates
 
     def elements(
         self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
@@ -119,8 +121,9 @@ class ObstaclePair(ContactPair, master=Obstacle):
         reach: float,
         held: IntArray,
         aimed: IntArray,
-    ) -> IntArray | None:
+    ) -> Asking[IntArray | None]:
         """None; raises if a node has gone through the obstacle and out of it again."""
+        yield from ()
         obstacle = self.obstacle
         if reach <= _PASSING * obstacle.width:
             return None

@@ -245,7 +245,8 @@ class OverlapWatch:
                 change = after - before
                 # An obstacle has no body.
                 moved[i, j] = range_of(change) if body is None else body.motion_range(change)
-        self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
+        if near:
+            self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
         due = []
         for (k, looked, where), way in zip(near, relative_way(moved).tolist(), strict=True):
             looks = way > (0.0 if last else looked.pause.due)

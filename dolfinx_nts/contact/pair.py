@@ -15,9 +15,9 @@ import numpy as np
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.slip_friction import at_rest
-from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import Asking, global_max
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import is_finite, known_options, require_bool, require_one_of
@@ -112,8 +112,9 @@ class ContactPair:
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
         friction: Coulomb's coefficient mu [-], >= 0; above 1e6 it counts as 1e6, but infinite:
             nodes in contact stick. Or a function of arrays (n,) of the speed of slip in the step
-            [m/s], 0 in statics, and of the pressure of each node's force over its area [Pa], which
-            returns positive coefficients, such as lambda v, p: 0.2 + 0.1 * np.exp(-v / 0.01).
+            [m/s], 0 in statics, and of the pressure of each node's force over its undeformed area
+            [Pa], which returns positive coefficients, such as
+            lambda v, p: 0.2 + 0.1 * np.exp(-v / 0.01).
         interference: What becomes of slave nodes that start inside the master by more than one part
             in a hundred of a facet. "refuse" them, or "resolve" it, as for a press fit: the load
             steps of `equilibrium` press nodes out that start up to half a facet deep, in proportion
@@ -144,29 +145,29 @@ class ContactPair:
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
         ValueError: friction or `adjust` is negative or no number, `interference` or `integration`
-            is unknown, the surfaces share nodes, "surface" of an obstacle, which has no facets, or
-            "surface" between rigid bodies, of a smoothed master, of nodes without mass or with
+            is unknown, the surfaces share nodes, or
+            "surface" where no body deforms, of a smoothed master, of nodes without mass or with
             `adjust`.
     """
 
     #: Whether it keeps nodes out where they are; else what is around them, in the mean.
     holds_nodes: ClassVar[bool] = True
+    #: What of the slave is kept out.
+    integration: ClassVar[str] = "nodes"
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 
     def __init_subclass__(cls, master: type | None = None, integration: str = "nodes") -> None:
         if master is not None:
+            cls.integration = integration
             ContactPair._kinds[master, integration] = cls
 
     def __new__(
         cls, slave: Any = None, master: Any = None, *_: Any, integration: Any = "nodes", **__: Any
     ) -> ContactPair:
         """Make a pair of the kind that the master and the integration ask for."""
-        kinds = (
-            pair for (kind, how), pair in cls._kinds.items()
-            if isinstance(master, kind) and how == integration
-        )  # fmt: skip
-        return super().__new__(next(kinds, cls))
+        kinds = {how: pair for (kind, how), pair in cls._kinds.items() if isinstance(master, kind)}
+        return super().__new__(kinds.get(integration, cls))
 
     def __init__(
         self, slave: Surface, master: Any, *, friction: Any = 0.0, interference: str = "refuse",
@@ -201,7 +202,7 @@ class ContactPair:
             )
         self.slave, self.friction, self.interference = slave, rest, interference
         self.master: Any = master
-        self.edges, self.adjust, self.integration = edges, float(adjust), integration
+        self.edges, self.adjust = edges, float(adjust)
         # Searches reach farther by the largest gap that counts as none.
         self.offset, self.lift = np.zeros(len(slave.share)), 0.0
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
@@ -301,7 +302,7 @@ class ContactPair:
         Args:
             u: Owned displacements of each of `bodies` [m].
         """
-        return (self._moved(self.slave, u[0]),)
+        return self._moved((self.slave,), u)
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
@@ -347,8 +348,8 @@ class ContactPair:
         path: FloatArray,
         motion: Motion | None = None,
         followed: BoolArray | None = None,
-    ) -> Found:
-        """Search for this rank's candidates; every rank must call it.
+    ) -> Asking[Found]:
+        """Search for this rank's candidates; as of `together`.
 
         A node is a candidate behind its facet only if it has come there through the surface. One
         that has passed by the surface's edge is let through, and followed again once it is outside.
@@ -395,8 +396,10 @@ class ContactPair:
         reach: float,
         held: IntArray,
         aimed: IntArray,
-    ) -> IntArray | None:
-        """For each slave of the rank the facet that should hold it, not its own, or -1. Collective.
+    ) -> Asking[IntArray | None]:
+        """For each slave of the rank the facet that should hold it, not its own, or -1.
+
+        As of `together`.
 
         It has come through it unseen, or is held in the plane of another one, beside the body.
 
@@ -433,8 +436,11 @@ class ContactPair:
         same_nodes = alike and np.array_equal(self.slave.points, other.slave.points)
         return same_nodes and self.has_master_of(other)
 
-    def _moved(self, surface: Surface, u: FloatArray) -> FloatArray:
-        return surface.reference - self.origin + surface.gather(u)
+    def _moved(
+        self, surfaces: Sequence[Surface], u: Sequence[FloatArray]
+    ) -> tuple[FloatArray, ...]:
+        both = zip(surfaces, gather_each(surfaces, u), strict=True)
+        return tuple(surface.reference - self.origin + moved for surface, moved in both)
 
 
 def _at_rest(friction: Any) -> float:

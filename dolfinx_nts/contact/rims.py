@@ -12,6 +12,7 @@ from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.normal_cones import LETS_IN
 from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.kernels import compiled, facets
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 
@@ -39,7 +40,7 @@ class Rims:
         found: Candidates,
         x: tuple[FloatArray, FloatArray],
         ways: Sequence[FloatArray],
-    ) -> Candidates:
+    ) -> Asking[Candidates]:
         """Candidates but for those beyond such a rim where the slave does not lie inside it.
 
         What slides over a rim turns about it, and edges hold it there: the plane of the facet
@@ -56,7 +57,7 @@ class Rims:
             return found
         gaps = np.full(len(self._slave.share), np.inf)
         gaps[found.node] = found.gap
-        gaps, moved = self._slave.at_all(gaps), x[0] + ways[0]
+        gaps, moved = (yield from self._slave.spread(gaps)), x[0] + ways[0]
         some = np.flatnonzero(self._any[found.facet])
         facet, corners = found.facet[some], x[1] + ways[1]
         node = self._slave.share[found.node[some]]

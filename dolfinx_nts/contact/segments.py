@@ -16,7 +16,7 @@ from dolfinx_nts.kernels import library
 from dolfinx_nts.types import FloatArray, IntArray
 
 #: Cosine of the angle between the normals of two facets from which on they do not face each other.
-_FACING = -0.1
+FACING = -0.1
 #: Distance from an edge over the size of the facet that is on it.
 _ON = 1e-12
 #: Part of a facet that is no piece of it.
@@ -76,7 +76,7 @@ def segments(own: FloatArray, other: FloatArray, pairs: tuple[IntArray, IntArray
         pairs: Numbers of the facets of each pair.
     """
     one, two = (number.astype(np.int64, copy=False) for number in pairs)
-    kernel, cuts = library.load().segments, library.Cuts(_FACING, _ON, _NOTHING)
+    kernel, cuts = library.load().segments, library.Cuts(FACING, _ON, _NOTHING)
     given = own.shape[1], other.shape[1], len(one), own, other, one, two
     most = _PER_PAIR * len(one)
     while True:

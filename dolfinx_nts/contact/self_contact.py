@@ -17,7 +17,7 @@ from dolfinx_nts.contact.pair import INITIAL_PENETRATION, Candidates, Found, Mot
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import known_options
 
@@ -164,11 +164,11 @@ class SelfContact(FacetPair):
         path: FloatArray,
         motion: Motion | None = None,
         followed: BoolArray | None = None,
-    ) -> Found:
+    ) -> Asking[Found]:
         """Search for this rank's candidates, of one of two parts that face each other."""
-        found = super().find(positions, current, path, motion, followed)
+        found = yield from super().find(positions, current, path, motion, followed)
         c = found.candidates
-        if not anywhere(self.slave.body.comm, len(c.node) > 0):
+        if not (yield len(c.node) > 0):
             return found
         return found._replace(candidates=c.select(self._one_sided(c, current, positions[0])))
 
@@ -196,9 +196,9 @@ class SelfContact(FacetPair):
         reach: float,
         held: IntArray,
         aimed: IntArray,
-    ) -> IntArray | None:
+    ) -> Asking[IntArray | None]:
         """Do as `ContactPair`; what is behind a facet whose corners are held is the other part."""
-        hit = super().missed(positions, motions, path, reach, held, aimed)
+        hit = yield from super().missed(positions, motions, path, reach, held, aimed)
         if hit is not None:
             hit[(hit >= 0) & (held < 0) & self._carries(held)[hit]] = -1
         return hit

@@ -55,6 +55,27 @@ def held_before(contacts: Sequence[ContactPair]) -> list[BoolArray]:
     return found
 
 
+def meeting(contacts: Sequence[ContactPair], held: Sequence[BoolArray]) -> list[BoolArray]:
+    """Which points of each slave two contacts hold, such as a node between floor and wall.
+
+    Of rigid bodies none: there `Together` tells nodes of each other in any case.
+
+    Args:
+        contacts: Those of the system.
+        held: As of `held_before`: what another contact holds in place of this one.
+
+    Returns:
+        Of each contact, shape (points,).
+    """
+    found = [np.zeros(len(c.slave.points), dtype=bool) for c in contacts]
+    for i, j in _of_one_body({k: c for k, c in enumerate(contacts) if not c.redundant}):
+        one, two = contacts[i].slave.points, contacts[j].slave.points
+        both = np.intersect1d(one[~held[i]], two[~held[j]])
+        found[i] |= np.isin(one, both)
+        found[j] |= np.isin(two, both)
+    return found
+
+
 def drop_doubles(found: dict[int, ContactElements], histories: Sequence[ContactHistory]) -> None:
     """Keep one of two pairs that keep a node out of the same fixed surface.
 
@@ -79,14 +100,21 @@ def drop_doubles(found: dict[int, ContactElements], histories: Sequence[ContactH
                 found[k] = c.select(~np.isin(np.arange(len(c.candidates.node)), there))
 
 
-def areas(contacts: Sequence[ContactPair]) -> list[FloatArray]:
-    """Area of the pressure at each slave's points [m^2], (points,), with that of later contacts."""
-    own = [carried_areas(c.slave) for c in contacts]
-    found = [area.copy() for area in own]
+def carried_area(contacts: Sequence[ContactPair], k: int, u: FloatArray) -> FloatArray:
+    """Area of the pressure at the points of a contact's slave [m^2], (points,). Collective.
+
+    Args:
+        contacts: Those of the system; later ones give theirs at nodes that they share with this.
+        k: Number of the contact.
+        u: Owned displacements of the slave's body [m].
+    """
+    slave = contacts[k].slave
+    found = carried_areas(slave, slave.positions(u))
     for i, j, _ in _beside(contacts):
-        one, two = contacts[i].slave, contacts[j].slave
-        _, here, there = np.intersect1d(one.points, two.points, return_indices=True)
-        found[i][here] += own[j][there]
+        if i == k:
+            other = contacts[j].slave
+            _, here, there = np.intersect1d(slave.points, other.points, return_indices=True)
+            found[here] += carried_areas(other, other.positions(u))[there]
     return found
 
 

@@ -11,8 +11,9 @@ from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE
 from dolfinx_nts.contact.normal_cones import LETS_IN
 from dolfinx_nts.contact.pair import MARGIN, Candidates, Motion
+from dolfinx_nts.contact.surfaces import gather_each
 from dolfinx_nts.kernels import compiled, facets, nts_element
-from dolfinx_nts.parallel import anywhere, raise_together
+from dolfinx_nts.parallel import Asking, raise_together
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError
 
@@ -46,8 +47,8 @@ class SlavePaths:
         slave: FloatArray,
         master: FloatArray,
         motion: Motion,
-    ) -> Candidates:
-        """Candidates with the facets that their paths lead to in place of the closest. Collective.
+    ) -> Asking[Candidates]:
+        """Candidates with the facets that their paths lead to in place of the closest.
 
         Args:
             found: Candidates of the closest facets.
@@ -55,8 +56,7 @@ class SlavePaths:
             master: Points of the master at t_n [m].
             motion: Expected in the step.
         """
-        x, both = slave[self._slave.share], zip(self._pair.surfaces, motion.paths, strict=True)
-        ways = [surface.gather(path) for surface, path in both]
+        x, ways = slave[self._slave.share], gather_each(self._pair.surfaces, motion.paths)
         slave_path, master_path = ways[0][self._slave.share], ways[1]
         found = self._round_edges(found, x, master, slave_path, master_path)
         found = self._past_edges(found, slave, master, slave_path, master_path, motion.reach)
@@ -68,7 +68,7 @@ class SlavePaths:
             found = _replace(found, other)
         if self._pair.has_edges:
             along = [0.0 * way if motion.at_rest else way for way in ways]
-            found = self._pair.rims.without_rising(found, (slave, master), along)
+            found = yield from self._pair.rims.without_rising(found, (slave, master), along)
         aimed = motion.aimed
         if self._pair.is_long(motion.reach):
             stops = self._pair.stops(np.arange(len(x)), master)
@@ -300,19 +300,16 @@ class SlavePaths:
         reach: float,
         held: IntArray,
         aimed: IntArray,
-    ) -> IntArray | None:
-        """What `ContactPair.missed` returns. Collective."""
-        comm = self._slave.body.comm
+    ) -> Asking[IntArray | None]:
+        """What `ContactPair.missed` returns."""
         by_edges = np.flatnonzero((held >= 0) & self._convex.sharp[held])
         let_go = np.flatnonzero((held < 0) & (aimed >= 0) & self._convex.sharp[aimed])
         some = by_edges.size or let_go.size or len(self._sliding)
-        aside = self._convex.sharp.any() and anywhere(comm, bool(some))
+        aside = self._convex.sharp.any() and (yield bool(some))
         if not (aside or self._pair.is_long(reach)):
             return None
-        share = self._slave.share
-        both = zip(self._pair.surfaces, motions, strict=True)
-        slave_path, master_path = (surface.gather(path) for surface, path in both)
-        x, paths = positions[0][share], (slave_path[share], master_path)
+        share, ways = self._slave.share, gather_each((self._slave, self._master), motions)
+        x, paths = positions[0][share], (ways[0][share], ways[1])
         if aside:
             self._refuse_cut_corners(x, positions[1], *paths, let_go)
         hit = np.full(len(held), -1)
@@ -326,12 +323,12 @@ class SlavePaths:
             [np.column_stack([by_edges, held[by_edges]]), self._sliding]
         ).T
         if node.size:
-            end, whole = positions[0] + slave_path, np.ones(len(node))
-            master = positions[1], master_path
+            end, whole = positions[0] + ways[0], np.ones(len(node))
+            master = positions[1], ways[1]
             over = self._cones.across(node, facet, end[share[node]], end, master, whole)
             new = (over >= 0) & (over != aimed[node])
             new &= (held[node] >= 0) | self._cones.behind(
-                facet, end[share[node]], positions[1] + master_path
+                facet, end[share[node]], positions[1] + ways[1]
             )
             hit[node[new]] = over[new]
         return hit
@@ -432,8 +429,8 @@ class SlavePaths:
 
     def gather(self, paths: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Displacements of this rank's slaves and of all points of the master [m]. Collective."""
-        slave = self._slave.gather(paths[0])[self._slave.share]
-        return slave, self._master.gather(paths[1])
+        slave, master = gather_each((self._slave, self._master), paths)
+        return slave[self._slave.share], master
 
 
 def _replace(found: Candidates, other: Candidates) -> Candidates:

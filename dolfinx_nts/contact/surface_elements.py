@@ -1,9 +1,9 @@
 """Contact whose law holds for sums of the gaps of points: one multiplier, several elements.
 
-The points of a slave's facets have the elements of `FacetGap`; what the law is about, and has a
-multiplier, is g_A = sum_q C_qA g_q of a node, with constant C (theory section 17). Forces go back
-by the same C, so that energy and momenta are those of the points. The elements that bodies see are
-pairs of facets of slave and master: the sums of all points there.
+The points of a slave's facets have the elements of `FacetGap` or `ObstacleGap`; what the law is
+about, and has a multiplier, is g_A = sum_q C_qA g_q of a node, with constant C (theory section 17).
+Forces go back by the same C, so that energy and momenta are those of the points. The elements that
+bodies see are pairs of facets of slave and master, or the slave's alone: sums of all points there.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
 from dolfinx_nts.contact.contact_measure import Measured, Slip
 from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
@@ -26,7 +27,7 @@ from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, compiled_law
 from dolfinx_nts.kernels.vectors import cross, resultant
-from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.parallel import Asking, anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Convective coordinates by which points of an equilibrium may lie beside where they were cut, by
@@ -52,7 +53,7 @@ class SurfaceElements(ContactElements):
     """
 
     attachment: FacetAttachment
-    measure: FacetGap
+    measure: FacetGap | ObstacleGap
     sums: Sums
     frame: FloatArray
 
@@ -152,7 +153,8 @@ class SurfaceElements(ContactElements):
         """The measure's points (n, points, 3) from the nodes of elements [m]."""
         weights = self.attachment.weights
         corners = y if weights is None else np.matmul(weights, y)
-        return compiled.points_of(self.sums.element, self.sums.shape, corners)
+        points = compiled.points_of(self.sums.element, self.sums.shape, corners)
+        return points - self.attachment.path[1]
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gaps of the slaves beyond the overlap that is left [m]."""
@@ -160,18 +162,20 @@ class SurfaceElements(ContactElements):
 
     def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """Gaps of the slaves [m] by positions of all points."""
-        return self._gaps(self._placed(positions))
+        return self._gaps(self._placed(positions) - path)
 
     def _placed(self, positions: Sequence[FloatArray]) -> FloatArray:
         """The measure's points (n, points, 3) from positions of all points [m]."""
-        own, master = (
+        own, *others = (
             side[number[self.sums.element]]
             for side, number in zip(positions, self.attachment.numbers, strict=True)
         )
-        slave = np.einsum("nc,nci->ni", self.sums.shape, own)
-        other = self.attachment.other[self.sums.element]
-        master = self.pair.master.combine(master, other)
-        return np.concatenate([slave[:, None], master], axis=1)
+        points = np.einsum("nc,nci->ni", self.sums.shape, own)[:, None]
+        for control in others:
+            other = self.attachment.other[self.sums.element]
+            control = self.pair.master.combine(control, other)
+            points = np.concatenate([points, control], axis=1)
+        return points
 
     def _gaps(self, x: FloatArray) -> FloatArray:
         return self.sums.to_slaves(self.measure.gap(x))
@@ -180,28 +184,43 @@ class SurfaceElements(ContactElements):
         self, positions: Sequence[FloatArray], part: Contribution, repeats: int
     ) -> bool:
         """Whether points lie elsewhere over the master than where pieces were cut. Collective."""
-        xi = self.measure.projection(self._placed(positions))
-        carries = np.append(part.active, False)[self.sums.slot].any(axis=1)
-        moved = np.abs(xi - self.sums.cut).max(axis=1)[carries]
         limit = _STALE[min(repeats, len(_STALE) - 1)]
-        return anywhere(self.pair.slave.body.comm, bool((moved > limit).any()))
+        strayed = self.measure.has_strayed(self._placed(positions), self.sums.cut, limit)
+        carries = np.append(part.active, False)[self.sums.slot].any(axis=1)
+        return anywhere(self.pair.slave.body.comm, bool(strayed[carries].any()))
+
+    def _way_from(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+        """As of `ContactElements`, in the mean."""
+        way = self.measure.start - self._placed(positions) + path
+        return self._along_feet(way)
+
+    def _along_feet(self, motion: FloatArray) -> FloatArray:
+        """How slaves move against their feet in the mean [m], by points (n, points, 3)."""
+        foot = np.einsum("nk,nki->ni", self.measure.foot, motion[:, 1:])
+        return self.sums.to_slaves(motion[:, 0] - foot)
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """No augmented unknowns: those of points follow from their places."""
         return np.empty((self.num_elements, 0))
 
     # ---- an iterate
-    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
-        """As of `ContactElements`, by multipliers of the slaves at the corners. Collective."""
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Asking[Contribution]:
+        """As of `ContactElements`, by multipliers of the slaves at the corners."""
         width = self.law.num_constraints
         of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
         multiplier = self.law.scale[:, None] * of_corners[self._first]
         y = self._measured(x)
-        points = self._at_points(y, multiplier)
+        try:
+            points = self.measure.summed(y, self.sums, multiplier, self.frame)
+        except Exception:  # as of `ContactElements`
+            yield from self._together(np.empty(0), None, np.empty((0, 1)))
+            raise
         found = self._of_slaves(points, y, multiplier)
-        together = self._together(found.gap, found.slip, multiplier)
+        together = yield from self._together(found.gap, found.slip, multiplier)
         # What moves as prescribed is asked for with friction alone.
-        motion = self._motion(y) if self.law.prescribed else np.empty((len(multiplier), 1, 3))
+        motion = np.empty((len(multiplier), 1, 3))
+        if self.law.prescribed:
+            motion = self._along_feet(y - self.measure.start)[:, None]
         obeyed = self.law.obey(motion, found, multiplier, together)
         residual, tangent = points.residual, points.tangent
         if self.attachment.weights is not None:
@@ -213,38 +232,8 @@ class SurfaceElements(ContactElements):
             gap=found.gap,
             slip=found.slip.value if found.slip else np.empty((len(multiplier), 0)),
             coupling=points.force,
-            place=y,
+            place=y + self.attachment.path[1],
         )
-
-    def _motion(self, y: FloatArray) -> FloatArray:
-        """How slaves move against their feet in the mean [m], shape (slaves, 1, 3)."""
-        motion = y - self.measure.start
-        foot = np.einsum("nk,nki->ni", self.measure.foot, motion[:, 1:])
-        return self.sums.to_slaves(motion[:, 0] - foot)[:, None]
-
-    def _at_points(self, y: FloatArray, multiplier: FloatArray) -> compiled.OverSurface:
-        """What points contribute at an iterate, before the law, by corners of the facets.
-
-        Args:
-            y: Points of the measure at t_{n+1} [m].
-            multiplier: Of the slaves [kg m], shape (slaves, constraints).
-        """
-        sums, measure, given = self.sums, self.measure, None
-        xi = measure.projection(y)
-        if measure.rule != "mean-value":
-            own = sums.to_points(multiplier)
-            if multiplier.shape[1] > 1:
-                along = np.einsum("nk,nki->ni", multiplier[:, 1:], self.frame)
-                middle = measure.middle_tangents(y, xi)
-                own[:, 1:] = np.einsum("nai,ni->na", middle, sums.to_points(along))
-            found = measure.evaluate(y, np.empty((len(y), 0)), own)
-            slip = found.slip.gradient if found.slip else np.empty(0)
-            given = found.residual, found.tangent, slip
-        start = measure.start, measure.normal, measure.xi, measure.length
-        return compiled.over_surface(
-            start, (y, xi), measure.theta, sums.element, sums.slot, sums.shape, sums.share,
-            multiplier, self.frame, self.num_elements, given,
-        )  # fmt: skip
 
     def _of_slaves(
         self, points: compiled.OverSurface, y: FloatArray, multiplier: FloatArray
@@ -282,7 +271,7 @@ class SurfaceElements(ContactElements):
         if self.law.imposed is not None:
             return None
         sums = self.sums
-        there = sums.shape * sums.to_points(force)[:, None]
+        there = sums.hat * sums.to_points(force)[:, None]
         pull: FloatArray = sums.by_slave(there[:, :, None])[:, 0]
         return (force < 0.0) & (pull > 0.0)
 
@@ -320,28 +309,32 @@ class SurfaceElements(ContactElements):
 
     def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As of `ContactElements`."""
-        size, width, y = self.num_coordinates, self.law.num_constraints, part.place
+        size, width = self.num_coordinates, self.law.num_constraints
+        y = part.place - self.attachment.path[1]
         gaps = part.tangent[:, size::width, :size]
         each = np.append(push / self.law.scale, 0.0)[self._slot]
         pulls = self.sums.to_points(push)[:, None] * self.measure.normal_at(y)
-        return np.einsum("ec,ecz->ez", each, gaps), resultant(self.pair.origin + y[:, 0], pulls)
+        place = self.pair.origin + part.place[:, 0]
+        return np.einsum("ec,ecz->ez", each, gaps), resultant(place, pulls)
 
     def _pushes(self, part: Contribution) -> list[tuple[IntArray, FloatArray]]:
         """As of `ContactElements`."""
-        own, master = (number[self.sums.element] for number in self.attachment.numbers)
-        of_slave = np.einsum("nc,ni->nci", self.sums.shape, -part.coupling[:, 0])
-        of_master = -part.coupling[:, 1:]
-        if self.pair.master.weights is not None:
-            weights = self.pair.master.weights[self.attachment.other[self.sums.element]]
-            of_master = np.einsum("nkp,nki->npi", weights, of_master)
-        return [(own, of_slave), (master, of_master)]
+        own, *others = (number[self.sums.element] for number in self.attachment.numbers)
+        found = [(own, np.einsum("nc,ni->nci", self.sums.shape, -part.coupling[:, 0]))]
+        for number in others:
+            of_master, weights = -part.coupling[:, 1:], self.pair.master.weights
+            if weights is not None:
+                of = weights[self.attachment.other[self.sums.element]]
+                of_master = np.einsum("nkp,nki->npi", of, of_master)
+            found.append((number, of_master))
+        return found
 
 
 def surface_elements(
     pair: Any,
     found: Candidates,
     attachment: FacetAttachment,
-    measure: FacetGap,
+    measure: FacetGap | ObstacleGap,
     sums: Sums,
     step: Step,
 ) -> SurfaceElements:

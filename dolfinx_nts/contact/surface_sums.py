@@ -12,6 +12,7 @@ import scipy.sparse
 from dolfinx_nts.contact.contact_measure import Batch
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.kernels import compiled
 from dolfinx_nts.types import FloatArray, IntArray
 
 _STILL = np.zeros(3), np.zeros(3)
@@ -19,41 +20,53 @@ _STILL = np.zeros(3), np.zeros(3)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FacetAttachment(Batch):
-    """Facets of a slave over facets of a master, see `Attachment`; axis 0 = pair of these."""
+    """Facets of a slave over facets of a master, see `Attachment`; axis 0 = pair of these.
+
+    Attributes:
+        slave: Its surface.
+        own: Facets of the slave, shape (n,).
+        master: Surface of the master; None: it has none.
+        other: Facets of the master, shape (n,), or zeros.
+        path: As of `Attachment`.
+    """
 
     slave: Surface
-    master: Surface
     own: IntArray
+    master: Surface | None
     other: IntArray
-    path = _STILL
+    path: tuple[FloatArray, FloatArray] = _STILL
     shares = None
 
     @property
-    def surfaces(self) -> tuple[Surface, Surface]:
-        """Those of the slave and of the master."""
-        return self.slave, self.master
+    def surfaces(self) -> tuple[Surface, ...]:
+        """That of the slave, and of the master."""
+        return (self.slave,) if self.master is None else (self.slave, self.master)
 
     @property
-    def numbers(self) -> tuple[IntArray, IntArray]:
+    def numbers(self) -> tuple[IntArray, ...]:
         """The slave's nodes, and the points that the master's patches depend on."""
-        return self.slave.face_nodes[self.own], self.master.patches[self.other]
+        own = self.slave.face_nodes[self.own]
+        return (own,) if self.master is None else (own, self.master.patches[self.other])
 
     @cached_property
-    def sides(self) -> tuple[Points, Points]:
+    def sides(self) -> tuple[Points, ...]:
         """Nodes that these depend on."""
         corners = self.slave.material.joined(self.slave.face_nodes[self.own])
+        if self.master is None:
+            return (corners,)
         return corners, self.master.facet_nodes.select(self.other)
 
     @cached_property
     def weights(self) -> FloatArray | None:
         """Weights of these in the corners, (n, corners of both, nodes); None if they are one."""
-        control, material = self.master.facet_weights, self.slave.material
+        control = None if self.master is None else self.master.facet_weights
+        material = self.slave.material
         if material.are_nodes and control is None:
             return None
         of_corners = material.weights[self.slave.face_nodes[self.own]]
         n, corners, nodes = of_corners.shape
         if control is None:
-            width = self.master.facet_nodes.nodes.shape[1]
+            width = sum(side.nodes.shape[1] for side in self.sides[1:])
             of_master = np.broadcast_to(np.eye(width), (n, width, width))
         else:
             of_master = control[self.other]
@@ -65,7 +78,8 @@ class FacetAttachment(Batch):
 
     def place(self, i: int) -> str:
         """The facets' numbers."""
-        return f"facets {int(self.own[i])} and {int(self.other[i])}"
+        own = f"facet {int(self.own[i])}"
+        return own if self.master is None else f"{own} and facet {int(self.other[i])}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,6 +92,7 @@ class Sums(Batch):
         slot: Slaves whose gaps it is a part of, one at each corner of its facet; -1: none.
         share: Its parts C_qA in their gaps [-], 0 where there is none, shape (n, corners).
         shape: Weights of the facet's corners in it, shape (n, corners).
+        hat: Shape functions of these slaves in it, >= 0, shape (n, corners).
         cut: Where on the master's facets they were when they were chosen, shape (n, 2).
     """
 
@@ -86,6 +101,7 @@ class Sums(Batch):
     slot: IntArray
     share: FloatArray
     shape: FloatArray
+    hat: FloatArray
     cut: FloatArray
 
     @cached_property
@@ -116,6 +132,29 @@ class Sums(Batch):
         """C^T times values of slaves (slaves, ..), shape (n, ..)."""
         return np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
 
+    def how(self, multiplier: FloatArray, frame: FloatArray) -> compiled.Summed:
+        """The same for kernels, of slaves that carry so much along directions."""
+        number = int(self.element[-1]) + 1 if len(self.element) else 0
+        return compiled.Summed(
+            self.element, self.slot, self.shape, self.share, multiplier, frame, number
+        )
+
+    def carried(
+        self, multiplier: FloatArray, frame: FloatArray, along: FloatArray
+    ) -> FloatArray:
+        """Multipliers of points (n, m) from those of slaves (slaves, m), whose forces are vectors.
+
+        Args:
+            multiplier: lambda_N, or lambda_N and forces along two directions.
+            frame: These directions, shape (slaves, 2, 3).
+            along: Those of the points, shape (n, 2, 3).
+        """
+        own = self.to_points(multiplier)
+        if multiplier.shape[1] > 1:
+            pull = self.to_points(np.einsum("nk,nki->ni", multiplier[:, 1:], frame))
+            own[:, 1:] = np.einsum("nai,ni->na", along, pull)
+        return own
+
     def moves(self, attachment: FacetAttachment, foot: FloatArray) -> list[Any]:
         """Weights of each surface's points in the motion of slaves against their feet, sparse.
 
@@ -123,13 +162,14 @@ class Sums(Batch):
             attachment: Facets of the elements.
             foot: Weights of the control points of the master's facets in the points' feet.
         """
-        if attachment.master.weights is not None:
-            weights = attachment.master.weights[attachment.other[self.element]]
+        master = attachment.master
+        if master is not None and master.weights is not None:
+            weights = master.weights[attachment.other[self.element]]
             foot = np.einsum("nk,nkp->np", foot, weights)
         # Corners without a slave have one beyond the last.
         slave = np.where(self.slot < 0, self.slaves, self.slot)
         of_slaves = _sparse(self.share, slave, self.slaves + 1).T.tocsr()[: self.slaves]
-        both = zip(attachment.surfaces, attachment.numbers, (self.shape, -foot), strict=True)
+        both = zip(attachment.surfaces, attachment.numbers, (self.shape, -foot), strict=False)
         return [
             of_slaves @ _sparse(weights, numbers[self.element], len(surface.points))
             for surface, numbers, weights in both

@@ -8,7 +8,7 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from types import MappingProxyType
@@ -20,12 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.convex_edges import ConvexEdges
+from dolfinx_nts.contact.edges import Edges, sharp_edges
 from dolfinx_nts.contact.faces import Faces
 from dolfinx_nts.contact.skins import Skin
-from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.points import Points, nodal_of
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches, triangle_patches
-from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.parallel import Asking, gather_rows, together
 from dolfinx_nts.types import Array, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -220,7 +222,17 @@ class Surface:
         of_points = np.einsum("mpk,mpka->mpa", m.weights[self.patches], same & first[:, None, None])
         return self.combine(of_points, np.arange(len(nodes)))
 
-    @property
+    @cached_property
+    def convex(self) -> ConvexEdges:
+        """Which facets meet at its edges, and at which the surface turns away from slaves."""
+        return ConvexEdges(self.facets, self.reference[self.facets])
+
+    @cached_property
+    def sharp_edges(self) -> Edges:
+        """Sharp edges of its body that one of its facets is at. Collective."""
+        return sharp_edges(self.body.boundary(), self)
+
+    @cached_property
     def boundary_edges(self) -> npt.NDArray[np.bool_]:
         """Whether edge k (corner k to k + 1) of a facet is no other facet's, shape (m, nc)."""
         edges = np.stack([self.facets, np.roll(self.facets, -1, axis=1)], axis=-1)
@@ -252,8 +264,12 @@ class Surface:
 
     def at_all(self, values: Array) -> Array:
         """Values at all points from those at the points of `share`, else 0. Collective."""
+        return together(self.body.comm, [self.spread(values)])[0]
+
+    def spread(self, values: Array) -> Asking[Array]:
+        """`at_all` as of `together`."""
         table = np.zeros((len(self.points), *values.shape[1:]), dtype=values.dtype)
-        table[self._dealt] = gather_rows(self.body.comm, values)
+        table[self._dealt] = yield values
         return table
 
     def at_own(self, values: Array) -> Array:
@@ -305,6 +321,18 @@ class Surface:
     def positions(self, u: FloatArray) -> FloatArray:
         """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
         return self.reference + self.gather(u)
+
+
+def gather_each(surfaces: Sequence[Surface], values: Sequence[FloatArray]) -> list[FloatArray]:
+    """`Surface.gather` of several surfaces, in one call. Collective.
+
+    Args:
+        surfaces: The surfaces.
+        values: Of each this rank's owned coordinates of its body.
+    """
+    sides = [surface.material for surface in surfaces]
+    found = nodal_of(sides, values)
+    return [side.combine(own) for side, own in zip(sides, found, strict=True)]
 
 
 def _distinct(rows: IntArray) -> IntArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -137,6 +137,15 @@ class Couplings:
                 found.append(linked[batch.joint] if several else linked[0] if len(linked) else None)
         return found
 
+    def extents(self) -> FloatArray:
+        """Largest `Elements.extent` of all, then of each of `mechanisms`, on this rank [m]."""
+        found = np.zeros(1 + self.mechanisms)
+        for batch, of in zip(self.elements, self.linked, strict=True):
+            found[0] = max(found[0], batch.extent)
+            if of is not None:
+                np.maximum.at(found, 1 + of, batch.extents if np.ndim(of) else batch.extent)
+        return found
+
     @property
     def loads(self) -> dict[int, Load]:
         """Of the batches among `elements` whose laws depend on what their joints carry."""
@@ -209,6 +218,14 @@ class Couplings:
             coupling.elements = [
                 replace(c, law=replace(c.law, width=width, gap_width=gap_width))
                 for c in coupling.elements
+            ]
+
+    def steepen(self, scales: Iterable[FloatArray | float]) -> None:
+        """Let slips tell which contacts stick, by scales of each batch, see `ContactLaw.steep`."""
+        given = iter(scales)
+        for coupling in self._of_contacts:
+            coupling.elements = [
+                replace(c, law=replace(c.law, steep=next(given))) for c in coupling.elements
             ]
 
     def forget_solution(self) -> None:

@@ -12,12 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import compress
+from operator import is_not
 from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.alike import Alike
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.body_tangents import BodyTangents
 from dolfinx_nts.equations.couplings import Couplings
@@ -25,14 +28,14 @@ from dolfinx_nts.equations.flight import Flight
 from dolfinx_nts.equations.loads import Loads
 from dolfinx_nts.equations.mass_solves import Saddle
 from dolfinx_nts.equations.scales import Lengths, Rounding, stiffness_between
-from dolfinx_nts.equations.shared_weight import SharedWeight
+from dolfinx_nts.equations.shared_weight import ActiveRows, SharedWeight
 from dolfinx_nts.equations.sleep import Sleepers
 from dolfinx_nts.equations.stabilization import Stabilization
 from dolfinx_nts.equations.supports import StepSupports
 from dolfinx_nts.equations.unknowns import Unknowns
-from dolfinx_nts.interaction.elements import Step, evaluate_together
+from dolfinx_nts.interaction.elements import Raised, Step, evaluate_here, raise_of_all
 from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, EvaluationPoint
-from dolfinx_nts.parallel import everywhere, global_max
+from dolfinx_nts.parallel import Asking, global_max, sums_and_largest, together
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
@@ -43,6 +46,8 @@ _STEADY = 1e-6
 _TRIED = 1e-7
 #: How much farther than its supports a body may come, as the end of a beam whose other end turns.
 _FARTHEST = 1e3
+#: What elements contribute on this rank, or raise there, and rows of weight that is shared.
+_Parts = tuple[tuple[Any, ...], Raised | None, ActiveRows]
 
 
 class StepProblem:
@@ -67,6 +72,7 @@ class StepProblem:
         rounding: What part of the forces on bodies is rounding.
         stabilization: In statics, what holds each node at t_n.
         lengths: Lengths of the scene, and of the step after `begin`.
+        extents: Largest `Elements.extent` of each of `Couplings.mechanisms`, on all ranks [m].
         loads: When the step takes which loads.
         is_awake: Whether each body is in the step, shape (bodies,).
         sleepers: Bodies that the step leaves out.
@@ -84,7 +90,8 @@ class StepProblem:
         self.batches = system.batches
         self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
         # What batches contribute that have no element on any rank: nothing, at every iterate.
-        self._of_none: tuple[Any, ...] | None = None
+        self._of_none: _Parts | None = None
+        self._alike = Alike(())
         self.awake: tuple[int, ...] = ()
         self.is_awake = np.zeros(self.batches.count, dtype=bool)
         self._numbers: tuple[Any, ...] | None = None
@@ -153,6 +160,7 @@ class StepProblem:
             self.batches.split(first), self.batches.split(way), lengths.motion, length,
             self.stabilization.stiffness, self.loads.moments, self.rounding.of,
         )  # fmt: skip
+        self.batches.share(state.u, step.ahead, step.first)
         self.couplings.begin(step, again, search)
         self.sleepers.forces = {}
         if self._sleep and sleep:
@@ -198,6 +206,7 @@ class StepProblem:
         Args:
             e: Solution of the step without them.
         """
+        self._share(e)
         if not self.couplings.wake(e):
             return False
         self.sleepers.rouse(self.sleepers.forces.keys() & self.couplings.touched())
@@ -212,7 +221,13 @@ class StepProblem:
         Raises:
             StepFailedError: Only a shorter step helps.
         """
+        self._share(e)
         return self.couplings.misses(e, self.lengths.motion_of(e))
+
+    def _share(self, e: Evaluation) -> None:
+        """Let all ranks know where a solution has rigid bodies. Collective."""
+        if self.system.comm.size > 1:
+            self.batches.share([terms.u1 for terms in e.bodies], [terms.du for terms in e.bodies])
 
     def _lay_out(self, again: Evaluation | None) -> None:
         """Layout of the unknowns, kept while no rank's elements change, and a first guess.
@@ -230,17 +245,32 @@ class StepProblem:
         places = [a for c in elements for a in c.points()]
         numbers = (np.array(self.awake), widths, *places, *combined)
         self._bearing = self.couplings.loads
-        if not everywhere(system.comm, _equal(numbers, self._numbers)):
+        contacts = self.couplings.contacts
+        # From bodies that free flight has pressed deep into each other iterates may not find back.
+        dives = [contacts.dives()] if self.integrator.inertia else []
+        changed, _, *deep = together(
+            system.comm, [self._changes(numbers), contacts.watch(), *dives]
+        )
+        self.dives = any(deep)
+        if changed:
             self.destroy()
             of = self.couplings.bodies
             self.unknowns = Unknowns(self.batches, self.awake, elements, of, self._bearing)
             self.version += 1
             self._numbers = numbers
         self._of_none = None
-        # From bodies that free flight has pressed deep into each other iterates may not find back.
-        self.dives = self.integrator.inertia and self.couplings.contacts.dives()
         self._again = again
         self.first_guess()
+
+    def _changes(self, numbers: tuple[Any, ...]) -> Asking[bool]:
+        """Whether any rank's elements have other numbers than before, as of `together`.
+
+        Notes the extents of all elements.
+        """
+        own = [float(not _equal(numbers, self._numbers)), *self.couplings.extents()]
+        _, (changed, self._extent, *linked) = yield np.empty(0), np.array(own)
+        self.extents = np.array(linked)
+        return bool(changed)
 
     def first_guess(self) -> None:
         """Write into `x` what the iterations of the step begin with."""
@@ -293,19 +323,36 @@ class StepProblem:
         self.laid.guess(places, self.flight.ends, self.elements, multipliers)
 
     # ---- iterates
-    def evaluate(self, x: PETSc.Vec) -> Evaluation:
-        """The step equations at an iterate; no state changes. Every rank must call it."""
-        values, laid = x.array_r.copy(), self.laid
-        if laid.blocks or self._of_none is None:
-            parts = self._parts_of_elements(x, values)
-            self._of_none = None if laid.blocks else parts
-        else:
-            parts = self._of_none
-        force = laid.forces(self.elements, parts) if laid.blocks else np.zeros(len(values))
+    def evaluate(self, x: PETSc.Vec, last: Evaluation | None = None) -> Evaluation:
+        """The step equations at an iterate; no state changes. Every rank must call it.
+
+        What ranks have to agree on travels in one reduction.
+
+        Args:
+            x: The iterate.
+            last: The one before, which is returned if its unknowns are the same on all ranks.
+        """
+        values, laid, comm = x.array_r.copy(), self.laid, self.system.comm
+        new = last is None or not np.array_equal(last.x, values)
+        if last is not None and not new and comm.size == 1:
+            return last
         # Most often bodies at rest before something hits them stay where the last iterate had them.
-        known = {j: terms[0] for j, terms in self._evaluated.items()}
         places = laid.read(values, self._u0)
-        for j in self.elsewhere(places, known):
+        moves = self._moves(places, {j: terms[0] for j, terms in self._evaluated.items()})
+        ways = [np.abs(places[j] - self._u0[j]).max(initial=0.0) for j in laid.awake]
+        moved = float(max(ways, default=0.0))
+        parts, raised, active = self._of_none or self._parts_of_elements(x, values)
+        turned = last is not None and self._turned(last, parts)
+        own = [float(raised is not None), float(new), float(turned), moved, *moves]
+        measures = self._measures(parts)
+        counts, found = sums_and_largest(comm, active.counts, np.append(own, measures))
+        if found[0]:
+            raise_of_all(comm, raised)
+        if last is not None and not found[1]:
+            return last
+        self.shared_weight.divide(active, counts)
+        force = laid.forces(self.elements, parts) if laid.blocks else np.zeros(len(values))
+        for j in compress(laid.awake, found[4:]):
             self._evaluated[j] = self._without_elements(j, places[j])
         none = [np.zeros_like(u) for u in self._u0]
         coupling, terms = laid.read(force, none), []
@@ -317,21 +364,51 @@ class StepProblem:
                 u1, du, total = self._u0[j], none[j], internal - external
             pull = coupling[j]
             terms.append(BodyTerms(u1, du, internal, external, pull, total + pull))
-        return Evaluation(values, tuple(terms), self.batches.split, parts)
+        return Evaluation(
+            values, tuple(terms), self.batches.split, parts, moved=float(found[3]),
+            measures=found[4 + len(moves) :].reshape(measures.shape), turned=bool(found[2]),
+        )  # fmt: skip
 
-    def _parts_of_elements(self, x: PETSc.Vec, values: FloatArray) -> tuple[Any, ...]:
-        """What elements contribute at an iterate, whose part here is `values`. Collective."""
+    def _parts_of_elements(self, x: PETSc.Vec, values: FloatArray) -> _Parts:
+        """What elements contribute at an iterate, or raise here; rows of weight that is shared.
+
+        Collective.
+
+        Args:
+            x: The iterate.
+            values: Its part here.
+        """
         laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
         self.couplings.tell_loads(own, self._bearing)
-        parts = evaluate_together(self.system.comm, elements, positions, own)
-        touching = self.couplings.num_touching
-        self.shared_weight.divide(
+        alike = self._alike
+        if len(elements) != len(alike.of) or any(map(is_not, elements, alike.of)):
+            self._alike = alike = Alike(elements, alike)
+        parts, raised = evaluate_here(
+            self.system.comm, alike.elements, alike.places(positions), alike.own(own)
+        )
+        if raised is not None:
+            return (), raised, self.shared_weight.none
+        parts, touching = alike.apart(parts), self.couplings.num_touching
+        found = parts, None, self.shared_weight.active(
             elements[:touching], self.couplings.bodies, parts[:touching], positions[:touching],
             self._closed,
         )  # fmt: skip
-        return parts
+        self._of_none = None if laid.blocks else found
+        return found
+
+    def _turned(self, last: Evaluation, parts: tuple[Any, ...]) -> bool:
+        """Whether contacts have another status on this rank than in the last iterate."""
+        both = zip(last.parts, parts[: self.couplings.num_touching], strict=False)
+        return any(bool((a.status != b.status).any()) for a, b in both)
+
+    def _measures(self, parts: tuple[Any, ...]) -> FloatArray:
+        """`Evaluation.measures` on this rank; zeros where elements raised."""
+        found = np.zeros((len(self.elements) if "augmented" in self.laid.own else 0, 2))
+        for row, batch, part in zip(found, self.elements, parts, strict=False):
+            row[:] = batch.largest(part)[2:]
+        return found
 
     def _without_elements(self, j: int, u1: FloatArray) -> tuple[FloatArray, ...]:
         """A batch's u1, du, internal and external force and equation, no elements. Collective."""
@@ -350,10 +427,15 @@ class StepProblem:
             places: Displacements of each batch [m].
             known: Those there by the batch's number; one without is elsewhere.
         """
+        moves = global_max(self.system.comm, np.array(self._moves(places, known)))
+        return list(compress(self.laid.awake, moves))
+
+    def _moves(
+        self, places: Sequence[FloatArray], known: Mapping[int, FloatArray]
+    ) -> list[float]:
+        """1 for each batch awake that is `elsewhere` on this rank, else 0."""
         awake = self.laid.awake
-        here = [j not in known or not np.array_equal(places[j], known[j]) for j in awake]
-        anywhere = global_max(self.system.comm, np.array(here, dtype=np.float64))
-        return [j for j, moves in zip(awake, anywhere.tolist(), strict=True) if moves]
+        return [float(j not in known or not np.array_equal(places[j], known[j])) for j in awake]
 
     def displacements(self, x: FloatArray) -> list[FloatArray]:
         """Those of each batch at an iterate [m]: this rank's part of both."""
@@ -362,7 +444,7 @@ class StepProblem:
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
         motion = float(self.lengths.motion.max())
-        gap = np.array([0.0, 1.0, 0.0, 0.0])
+        gap = [0.0, 1.0, 0.0, 0.0]
         rounded = motion + self.lengths.rounded
         limits = batch.ratios(None, gap, motion, rounded, self.rtol)
         return 1.0 / limits[f"{batch.name} constraints"]
@@ -407,9 +489,8 @@ class StepProblem:
 
     @property
     def rounded_length(self) -> float:
-        """Largest length whose rounding enters forces and gaps [m]. Collective."""
-        local = max([self.lengths.span, *(c.extent for c in self.elements)])
-        return float(global_max(self.system.comm, np.array([local]))[0])
+        """Largest length whose rounding enters forces and gaps [m]."""
+        return max(self.lengths.span, self._extent)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

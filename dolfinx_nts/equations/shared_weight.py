@@ -26,6 +26,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.kernels.compiled_law import wrenches
+from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Square of the singular values that count as zero, over that of the largest.
@@ -36,7 +37,7 @@ _FEW = 8
 _PASSES = 3
 
 
-class _Rows(NamedTuple):
+class Rows(NamedTuple):
     """Active gaps, and slips of nodes that stick, of rigid bodies; axis 0 = row.
 
     Attributes:
@@ -54,6 +55,21 @@ class _Rows(NamedTuple):
     is_gap: BoolArray
 
 
+class ActiveRows(NamedTuple):
+    """Rows on this rank, and where they come from.
+
+    Attributes:
+        rows: The rows.
+        chosen: Of each of several parts their elements, row of the residual, scales, and whether
+            they are gaps.
+        counts: How many rows each rank has, but for other ranks 0; empty without rigid contacts.
+    """
+
+    rows: Rows
+    chosen: list[tuple[Any, IntArray, int, FloatArray, bool]]
+    counts: FloatArray
+
+
 def _is_rigid(pair: Any) -> bool:
     """Whether it is one of rigid bodies, with each other or with an obstacle."""
     return all(body.rigid for body in pair.bodies)
@@ -64,6 +80,7 @@ class SharedWeight:
 
     Attributes:
         any_rigid: Whether any contact is of rigid bodies alone.
+        none: No rows.
         kept: Whether forces in the null space stay as they are: those of blurred laws press
             everywhere, and the least of them might pull.
     """
@@ -72,35 +89,28 @@ class SharedWeight:
         self._comm = comm
         self.any_rigid = any(_is_rigid(pair) for pair in contacts)
         self.kept = False
+        self.none = ActiveRows(_joined([]), [], np.zeros(comm.size if self.any_rigid else 0))
 
-    def divide(
+    def active(
         self,
         elements: Sequence[ContactElements],
         bodies: Sequence[tuple[int, ...]],
         parts: Sequence[Contribution],
         places: Sequence[FloatArray],
         closed: Callable[[ContactElements], float],
-    ) -> None:
-        """Write the rows of gaps and slips anew, (1 - P) g - c P lambda = 0. Collective.
-
-        P projects on the null space of what these forces push the bodies with at t_{n+1}, in
-        P lambda of those along the normals alone; c is the compliance that the matrix lends. As c
-        stands in the matrix, too, the iteration takes P lambda out, and the gaps close as without
-        it: P g vanishes with the rest.
-        Where it does not, as of feet that lie in no plane, gaps cannot all close, and some node has
-        to leave: the rows of bodies that touch each other stay as they are then.
+    ) -> ActiveRows:
+        """Return the rows of rigid contacts that may share a weight, for `divide`.
 
         Args:
             elements: Batches of contacts.
             bodies: Numbers of their bodies.
-            parts: Their contributions at an iterate, whose residuals are changed.
+            parts: Their contributions at an iterate.
             places: Nodes of the batches [m], as of `Elements.evaluate`.
             closed: Gap of a batch that counts as closed [m].
         """
-        if not self.any_rigid:
-            return
         found, chosen = [], []
-        for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=False):
+        batches = elements if self.any_rigid else ()
+        for batch, numbers, part, x in zip(batches, bodies, parts, places, strict=False):
             on = np.flatnonzero(part.active)
             if not on.size or not _is_rigid(batch.pair) or batch.law.gap_width:
                 continue
@@ -114,19 +124,38 @@ class SharedWeight:
             for of, row, limit in which:
                 found.append(_rows(batch, numbers, part, x, of, row, limit))
                 chosen.append((part, of, row, batch.law.scale[of], row == batch.gap_row))
-        own = _joined(found)
-        every = self._comm.allgather(own) if self._comm.size > 1 else [own]
-        rows = _joined(every)
-        if not len(rows.body):
+        if not found:
+            return self.none
+        own, counts = _joined(found), self.none.counts.copy()
+        counts[self._comm.rank] = len(own.body)
+        return ActiveRows(own, chosen, counts)
+
+    def divide(self, active: ActiveRows, counts: FloatArray) -> None:
+        """Write the rows of gaps and slips anew, (1 - P) g - c P lambda = 0. Collective.
+
+        P projects on the null space of what these forces push the bodies with at t_{n+1}, in
+        P lambda of those along the normals alone; c is the compliance that the matrix lends. As c
+        stands in the matrix, too, the iteration takes P lambda out, and the gaps close as without
+        it: P g vanishes with the rest.
+        Where it does not, as of feet that lie in no plane, gaps cannot all close, and some node has
+        to leave: the rows of bodies that touch each other stay as they are then.
+
+        Args:
+            active: Rows of an iterate, whose parts' residuals are changed.
+            counts: How many rows each rank has.
+        """
+        if not counts.any():
             return
-        first = sum(len(other.body) for other in every[: self._comm.rank])
+        own, chosen, number = active.rows, active.chosen, counts.astype(int)
+        rows = _unpacked(gather_rows(self._comm, _packed(own), number))
+        first = int(number[: self._comm.rank].sum())
         here = slice(first, first + len(own.body))
         null = _null_part(rows)[here, 0]
         forces = np.zeros(len(null))
         if not self.kept:
             gaps = np.flatnonzero(rows.is_gap)
             both = np.zeros(len(rows.body))
-            both[gaps] = _null_part(_Rows._make(a[gaps] for a in rows))[:, 1]
+            both[gaps] = _null_part(Rows._make(a[gaps] for a in rows))[:, 1]
             forces = both[here]
         ends = np.cumsum([0] + [len(on) for _, on, *_ in chosen])
         for (part, on, row, scale, is_gap), (start, stop) in zip(
@@ -138,7 +167,20 @@ class SharedWeight:
                 part.residual[on, row] -= scale * lent * forces[start:stop]
 
 
-def _joined(rows: Sequence[_Rows]) -> _Rows:
+def _packed(rows: Rows) -> FloatArray:
+    """Rows as one array, shape (n, 18)."""
+    push = rows.push.reshape(-1, 12)
+    return np.column_stack([rows.body, push, rows.value, rows.limit, rows.is_gap])
+
+
+def _unpacked(table: FloatArray) -> Rows:
+    return Rows(
+        table[:, :2].astype(int), table[:, 2:14].reshape(-1, 2, 6), table[:, 14:16], table[:, 16],
+        table[:, 17] > 0.0,
+    )  # fmt: skip
+
+
+def _joined(rows: Sequence[Rows]) -> Rows:
     """Those of several batches or ranks, one after the other."""
     if len(rows) == 1:
         return rows[0]
@@ -146,7 +188,7 @@ def _joined(rows: Sequence[_Rows]) -> _Rows:
         np.empty((0, 2), dtype=int), np.empty((0, 2, 6)), np.empty((0, 2)), np.empty(0),
         np.empty(0, dtype=bool),
     )  # fmt: skip
-    return _Rows(*map(np.concatenate, zip(none, *rows, strict=True)))
+    return Rows(*map(np.concatenate, zip(none, *rows, strict=True)))
 
 
 def _rows(
@@ -157,7 +199,7 @@ def _rows(
     on: IntArray,
     row: int,
     limit: Any,
-) -> _Rows:
+) -> Rows:
     push, start, scale = np.zeros((len(on), 2, 6)), 0, batch.law.scale[on]
     rows = part.tangent[on, row, : batch.num_coordinates] / scale[:, None]
     y = x[on]
@@ -167,7 +209,7 @@ def _rows(
         push[:, k] = wrenches(y[:, here], force[:, here], side.places[on], side.fixed[on])
         start = here.stop
     value = part.residual[on, row] / scale
-    return _Rows(
+    return Rows(
         np.tile([numbers[0], numbers[-1]], (len(on), 1)),
         push,
         np.column_stack([value, part.multiplier[on, row - batch.gap_row]]),
@@ -176,7 +218,7 @@ def _rows(
     )
 
 
-def _null_part(rows: _Rows) -> FloatArray:
+def _null_part(rows: Rows) -> FloatArray:
     """P g and P lambda, zero where gaps cannot all close, shape (n, 2)."""
     n = len(rows.body)
     known, place = np.unique(rows.body, return_inverse=True)

@@ -202,8 +202,12 @@ class ConstraintElements(PointElements):
 
     def ledger(self, part: ConstraintPart, factor: float) -> dict[str, float]:
         """Work of prescribed values, -lambda . (c_1 - c_0)."""
+        return {"external_work": float(self.works(part, factor).sum())}
+
+    def works(self, part: ConstraintPart, factor: float) -> FloatArray:
+        """`ledger` of each element [J], shape (n,)."""
         change = self.prescribed[1] - self.prescribed[0]
-        return {"external_work": -float((part.multiplier * change).sum()) / factor}
+        return -(part.multiplier * change).sum(axis=1) / factor
 
     def describe(self, part: ConstraintPart, flips: IntArray) -> tuple[float, str]:
         """The constraint that is off most."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from mpi4py import MPI
 
@@ -13,12 +13,14 @@ import numpy as np
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import Asking, anywhere, together
 from dolfinx_nts.state import State
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 _EPS = float(np.finfo(float).eps)
+#: Elements, and what they raised.
+Raised = tuple[Any, Exception]
 
 
 def over(value: float, limit: float) -> float:
@@ -118,6 +120,18 @@ class Part(Protocol):
         """What Newton's method may flip from iterate to iterate, shape (states, n)."""
 
 
+class Stopped(NamedTuple):
+    """What joints stopped in a step that moved freely before: at limits, as cables became taut.
+
+    Attributes:
+        impulses: With which they did, on the coordinates [N s], zero of others, shape (n, k).
+        lost: Energy that this took [J], shape (n,).
+    """
+
+    impulses: FloatArray
+    lost: FloatArray
+
+
 class Elements(Protocol):
     """A batch of elements in a step; axis 0 = element. They are never changed."""
 
@@ -177,8 +191,10 @@ class Elements(Protocol):
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
 
-    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part:
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part | Asking[Part]:
         """Residual and tangent. All ranks call it, also those without elements.
+
+        What needs other ranks asks them as of `parallel.together`, in one call for all batches.
 
         No later call may depend on it. What it raises on one rank ends the solution on all, see
         `evaluate_together`.
@@ -192,7 +208,7 @@ class Elements(Protocol):
         """The residual's rows of a field of own unknowns, shape (n, width)."""
 
     def largest(self, part: Any) -> list[float]:
-        """Four sizes on this rank whose maxima over all ranks `ratios` needs."""
+        """Two sizes of rows on this rank, and two that these are measured by."""
 
     def ratios(
         self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
@@ -201,8 +217,9 @@ class Elements(Protocol):
 
         Args:
             part: As of `largest`.
-            largest: `largest` over all ranks; where elements belong to several joints, the last one
-                is that of each element, shape (n,).
+            largest: `largest`, the last two over all ranks if there are augmented unknowns; where
+                joints link the elements' bodies, the last one is that of the linked ones, of each
+                element (n,) of several joints.
             motion: Largest motion of the step [m].
             rounded: Length whose rounding is in all positions [m].
             rtol: Tolerance of Newton's method.
@@ -227,6 +244,14 @@ class Elements(Protocol):
         """Sums of an accepted step on this rank, by columns of the balance table.
 
         All ranks return the same columns. A column that only a joint has is energy [J] that leaves.
+        """
+
+    def stopped(self, part: Any, rate: float) -> Stopped | None:
+        """What came to be held in an accepted step; None of what holds always, or never.
+
+        Args:
+            part: Solution of the step.
+            rate: Impulse over what forces are in the units of the step [1/s].
         """
 
     def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
@@ -263,18 +288,44 @@ def evaluate_together(
         UserFunctionError: One raised on some rank.
         StepFailedError: It raised this.
     """
-    parts: list[Any] = []
-    cause, problem = None, None
-    for batch, x, unknowns in zip(elements, places, own, strict=True):
+    parts, raised = evaluate_here(comm, elements, places, own)
+    if anywhere(comm, raised is not None):
+        raise_of_all(comm, raised)
+    return parts
+
+
+def evaluate_here(
+    comm: MPI.Comm,
+    elements: Sequence[Any],
+    places: Sequence[FloatArray],
+    own: Sequence[Mapping[str, FloatArray]],
+) -> tuple[tuple[Any, ...], Raised | None]:
+    """As `evaluate_together`, and what elements raised on this rank, of which others do not know.
+
+    Collective. If any rank has raised, all are to call `raise_of_all`.
+    """
+    raised: list[Raised] = []
+
+    def evaluated(batch: Any, *at: Any) -> Asking[Any]:
         try:
-            parts.append(batch.evaluate(x, unknowns))
+            part = batch.evaluate(*at)
+            return (yield from part) if isinstance(part, Generator) else part
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
-            if cause is None:
-                cause, problem = error, _problem(batch, error)
-    if global_max(comm, np.array([float(cause is not None)]))[0]:
-        kind, text, advises = next(filter(None, comm.allgather(problem)))
-        raise kind(text, advises=advises) from cause
-    return tuple(parts)
+            raised.append((batch, error))
+
+    return tuple(together(comm, map(evaluated, elements, places, own))), next(iter(raised), None)
+
+
+def raise_of_all(comm: MPI.Comm, raised: Raised | None) -> None:
+    """Raise what elements raised on the first rank where they did. Collective.
+
+    Raises:
+        UserFunctionError: One raised on some rank.
+        StepFailedError: It raised this.
+    """
+    problem = None if raised is None else _problem(*raised)
+    kind, text, advises = next(filter(None, comm.allgather(problem)))
+    raise kind(text, advises=advises) from (None if raised is None else raised[1])
 
 
 def _problem(batch: Any, error: Exception) -> tuple[type[StepFailedError], str, bool]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -65,6 +65,10 @@ class Evaluation:
         terms: Of each batch of bodies.
         split: From the coordinates of each batch to those of each body.
         parts: Contribution of each batch of elements.
+        moved: Largest motion of a coordinate on all ranks [m].
+        measures: What rows of augmented unknowns are measured by, over all ranks: the last two of
+            `Elements.largest` of each batch, shape (batches, 2); empty without such unknowns.
+        turned: Whether contacts have another status on any rank than in the iterate before.
         iterations: Newton iterations it took.
         min_det: Smallest det F of all bodies, once solved.
     """
@@ -73,13 +77,16 @@ class Evaluation:
     terms: tuple[BodyTerms, ...]
     split: Callable[[Sequence[FloatArray]], tuple[FloatArray, ...]]
     parts: tuple[Any, ...]
+    moved: float = 0.0
+    measures: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    turned: bool = True
     iterations: int = 0
     min_det: float = np.inf
 
     @cached_property
     def bodies(self) -> tuple[BodyTerms, ...]:
         """Terms of each body: views."""
-        names = [field.name for field in fields(BodyTerms)]
+        names = [of.name for of in fields(BodyTerms)]
         each = [self.split([getattr(of, name) for of in self.terms]) for name in names]
         return tuple(BodyTerms(*found) for found in zip(*each, strict=True))
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from dolfinx_nts.interaction.constraint_elements import SHIFT, TINY, largest_of_joints
-from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.interaction.elements import Step, Stopped
 from dolfinx_nts.interaction.kinematics import Kinematics
 from dolfinx_nts.interaction.measures import HoldingLaw, Measure, Move, holds
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
@@ -61,6 +61,7 @@ class MeasuredElements(PointElements):
             those without multiplier only.
         near: The measure at t_n, shape (n,).
         since: The measure where the step began, which a load step does in several solutions.
+        before: D at t_n, shape (n,); none without multiplier.
         entry: Column of the ledger for the work that it takes, and its sign; "": none.
         scale: Force per motion in the units of the step, shape (n,); 0 without multiplier.
         rest: Reference values of the nodes [m], shape (n, k, 3).
@@ -75,6 +76,7 @@ class MeasuredElements(PointElements):
     drift: FloatArray
     near: FloatArray
     since: FloatArray
+    before: FloatArray
     entry: tuple[str, float]
     scale: FloatArray
     rest: FloatArray
@@ -154,7 +156,9 @@ class MeasuredElements(PointElements):
             # What sticks at a limit is held twice.
             lent = np.where(row.by_force == 0.0, -SHIFT * row.by_end, row.by_force)
             of_row = unit, self.scale * row.value, unit * row.by_end, self.scale * lent
-            status, memory = row.status[None], np.column_stack([at_end, pull, self.since])
+            # Of a force that is to vanish rounding is left.
+            kept = np.where(row.value == force, 0.0, pull)
+            status, memory = row.status[None], np.column_stack([at_end, kept, self.since])
         library.run(
             library.load().forces_along, size // 3, a.shape[1], held, share, factor, n,
             measure.weights, *gradient[:2], ends, pull, slope, *of_row, du, residual, tangent, work,
@@ -177,6 +181,15 @@ class MeasuredElements(PointElements):
         slip: FloatArray = self.measure.length * (part.memory[:, 0] - self.since)
         return slip
 
+    def stopped(self, part: MeasuredPart, rate: float) -> Stopped | None:
+        """What reached a limit; None of other laws, which take energy as they are meant to."""
+        if self.entry[0] != "contact_defect" or not holds(self.law):
+            return None
+        pull, size = part.memory[:, 1], self.num_coordinates
+        new = (self.before == 0.0) & (pull != 0.0)
+        push = np.where(new, -rate * self.step.factor * pull / self.force_scale, 0.0)
+        return Stopped(push[:, None] * part.tangent[:, size, :size], np.where(new, part.work, 0.0))
+
     def largest(self, part: MeasuredPart) -> list[float]:
         """Nothing: each element has limits of its own."""
         return [0.0, 0.0, 0.0, 0.0]
@@ -196,8 +209,12 @@ class MeasuredElements(PointElements):
 
     def ledger(self, part: MeasuredPart, factor: float) -> dict[str, float]:
         """What leaves through it [J]."""
-        column, sign = self.entry
-        return {column: sign * float(part.work.sum())} if column else {}
+        column, _ = self.entry
+        return {column: float(self.works(part, factor).sum())} if column else {}
+
+    def works(self, part: MeasuredPart, factor: float) -> FloatArray:
+        """`ledger` of each element [J], shape (n,)."""
+        return self.entry[1] * part.work
 
     def describe(self, part: Any, flips: Any) -> tuple[float, str]:
         """The joint whose rows are largest."""
@@ -285,10 +302,10 @@ class Measured(EveryStep):
         memory = np.concatenate(history) if len(self._joints) > 1 else history
         y0 = self._rest + nodal(measure.sides, of, step.state.u)
         near = measure.kind.value(measure.vectors(y0), memory[:, 0])
-        drift, scale, since = np.empty(0), np.zeros(len(near)), near
+        drift, scale, since, before = np.empty(0), np.zeros(len(near)), near, np.empty(0)
         if holds(self.law):
             since = near if step.dt else memory[:, 2]
-            scale, self._force = self._scales(step), memory[:, 1]
+            scale, before = self._scales(step), memory[:, 1]
         else:
             moved = zip(step.moments, step.state.v, strict=True)
             drift = nodal(measure.sides, of, [
@@ -296,8 +313,8 @@ class Measured(EveryStep):
             ])  # fmt: skip
         return MeasuredElements(
             name=self._name, sides=measure.sides, measure=measure, law=self.law, step=step, y0=y0,
-            drift=drift, near=near, since=since, entry=self._joints[0].entry, scale=scale,
-            rest=self._rest, names=self._names, joint=self._joint,
+            drift=drift, near=near, since=since, before=before, entry=self._joints[0].entry,
+            scale=scale, rest=self._rest, names=self._names, joint=self._joint,
         )  # fmt: skip
 
     def _scales(self, step: Step) -> FloatArray:
@@ -347,5 +364,5 @@ class Measured(EveryStep):
         batch = self.elements[k]
         if not holds(batch.law):
             return super().guess(k, x)
-        guess: FloatArray = batch.step.factor / batch.force_scale * self._force
+        guess: FloatArray = batch.step.factor / batch.force_scale * batch.before
         return guess[:, None]

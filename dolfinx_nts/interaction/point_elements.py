@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinx_nts.interaction.combination import Combination, num_multipliers, of_multipliers
 from dolfinx_nts.interaction.coupling import StepWarning
-from dolfinx_nts.interaction.elements import Step, entries_of, over
+from dolfinx_nts.interaction.elements import Step, Stopped, entries_of, over
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import Kinematics, differenced, has_constraints, unknown
 from dolfinx_nts.interaction.points import Points
@@ -120,8 +120,8 @@ class PointElements:
         """Its constraints over what counts as converged, if it has any."""
         if not self.widths["constraints"]:
             return {}
-        limit = rtol * motion + 8 * _EPS * (rounded + float(largest[3]))
-        return {f"{self.name} constraints": over(float(largest[1]), limit)}
+        limit = rtol * motion + 8 * _EPS * (rounded + largest[3])
+        return {f"{self.name} constraints": over(largest[1], limit)}
 
     def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
         """Sums over the nodes of side k."""
@@ -139,6 +139,10 @@ class PointElements:
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Nothing lost."""
         return {}
+
+    def stopped(self, part: Any, rate: float) -> Stopped | None:
+        """Nothing stops."""
+        return None
 
     def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
         """The element with the largest rows."""

@@ -101,9 +101,7 @@ class Points:
         Args:
             values: At this rank's owned coordinates, shape (num_owned,).
         """
-        rows, index, counts = self._table
-        table = gather_rows(self.body.comm, values.reshape(-1, 3)[rows], counts)
-        return table[index]
+        return nodal_of([self], [values])[0]
 
     def gathered(self, values: FloatArray) -> FloatArray:
         """Sums at this rank's owned coordinates, (num_owned,), of values at nodes. Collective.
@@ -157,6 +155,33 @@ class Points:
         return self.weights.shape[1] == 1 and bool((self.weights == 1.0).all())
 
 
+def nodal_of(sides: Sequence[Points], values: Sequence[Array]) -> list[Array]:
+    """`Points.nodal` of several, what ranks have of all of them in one call. Collective.
+
+    Args:
+        sides: The points.
+        values: Of each at this rank's owned coordinates of its body.
+    """
+    found, asked = list[Array](), list[tuple[int, Array, IntArray]]()
+    for k, (side, own) in enumerate(zip(sides, values, strict=True)):
+        known = next((table for given, table in side.body.known if given is own), None)
+        if known is None:
+            rows, index, counts = side._table
+            asked.append((k, own.reshape(-1, 3)[rows], counts))
+            found.append(index)
+        else:
+            found.append(known[side.nodes])
+    if asked:
+        numbers, local, each = zip(*asked, strict=True)
+        counts = np.array(each)
+        table = gather_rows(sides[0].body.comm, np.concatenate(local), counts.sum(axis=0))
+        # Rank by rank those of all points; then in each rank those of one after another.
+        of = np.repeat(np.tile(np.arange(len(each)), counts.shape[1]), counts.T.ravel())
+        for i, k in enumerate(numbers):
+            found[k] = table[of == i][found[k]] if len(each) > 1 else table[found[k]]
+    return found
+
+
 def nodal(
     sides: Sequence[Points], of: Sequence[int], values: Sequence[FloatArray]
 ) -> FloatArray:
@@ -167,11 +192,11 @@ def nodal(
         of: Numbers of these in the system, see `Batches.batch_of`.
         values: At this rank's owned coordinates of each body of the system.
     """
-    found = []
-    for k, side in zip(of, sides, strict=True):
-        own = values[k] if k < len(values) else side.body.joined(values)
-        found.append(side.nodal(own))
-    return np.concatenate(found, axis=1)
+    own = [
+        values[k] if k < len(values) else side.body.joined(values)
+        for k, side in zip(of, sides, strict=True)
+    ]
+    return np.concatenate(nodal_of(sides, own), axis=1)
 
 
 def joined_sides(

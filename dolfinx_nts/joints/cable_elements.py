@@ -20,15 +20,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.interaction.constraint_elements import SHIFT
+from dolfinx_nts.interaction.elements import Step, Stopped
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.kernels.cable import Lengths, Stretched, turns
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-#: A group of eyelets that sticks yields by this part of the motion that its friction prevents in a
-#: step: where several share what holds, as in a tackle, they share its change evenly.
-_YIELDS = 1e-9
+#: Slip counts so many times a friction force of its size in what decides whether a group slips.
+_STEEP = 1e3
 #: Part of its length within which a cable is taut.
 _TAUT = 8.0 * float(np.finfo(float).eps)
 
@@ -195,6 +195,8 @@ class CableElements(PointElements):
             tangent[:, size:, :size] = unit * to_end.reshape(n, width - size, size)
             tangent[:, size:, size:] = unit * rows.by_force
             status = rows.status
+            # Of a force that is to vanish rounding is left.
+            told = np.where(rows.value[:, :1] == force[:, :1], 0.0, told)
             way = path - self.since
             if theta is None:
                 way = np.einsum("nvi,nvi->nv", mean, end - start) @ sums
@@ -241,18 +243,17 @@ class CableElements(PointElements):
         before = np.maximum(tension, 0.0)
         more, less = np.expm1(angle), -np.expm1(-angle)
         slip, rub = (path - self.since)[:, 1:], force[:, 1:]
-        # Half the way between the bounds at most: Newton's method goes from one to the other by way
-        # of sticking, however far it slips, or it would go to and fro.
-        half = 0.5 * (more + less) * before
-        trial = rub + np.clip(slip, -half, half)
+        # From one bound Newton's method goes to the other by way of sticking, however far it slips,
+        # or it would go to and fro. From between them slip decides: between two ends that are held
+        # a cable must slip, and equations by which it sticks there have no solution.
+        told = np.where(np.abs(slip) > _TAUT * path[:, :1], slip, 0.0)
+        trial = rub + np.clip(_STEEP * told, -less * before, more * before)
         on = trial >= more * before
         back = ~on & (trial <= -less * before)
         stick = ~(on | back)
         # A bound is T times `part`, which is `more` or -`less`.
         part = np.where(on, more, -less)
-        old = self.step.factor / self.scale * pulls_of(self.before, self.levels)[:, 1:]
-        yields = slip - _YIELDS * (rub - old)
-        value = np.hstack([value, np.where(stick, yields, rub - part * before)])
+        value = np.hstack([value, np.where(stick, slip, rub - part * before)])
         behind = self.sums[:, 1:].T[None, :, :, None] * grown
         slides = ((1.0 + part) * before)[:, :, None, None] * bent
         by_end = np.concatenate(
@@ -260,7 +261,8 @@ class CableElements(PointElements):
         )
         ahead = np.tril(np.ones_like(unit))[:-1]
         own = unit[1:] - (part * (tension > 0.0))[:, :, None] * ahead
-        own = np.where(stick[:, :, None], -_YIELDS * unit[1:], own)
+        # Groups of a tackle share what holds, and a limit may hold what sticks.
+        own = np.where(stick[:, :, None], -SHIFT * unit[1:], own)
         by_force = np.concatenate([by_force, own], axis=1)
         return _Rows(value, by_end, by_force, np.hstack([held, stick, on]).T)
 
@@ -314,6 +316,17 @@ class CableElements(PointElements):
     def ledger(self, part: CablePart, factor: float) -> dict[str, float]:
         """Work of the winch, what a jerk takes that makes it taut, and friction [J]."""
         return dict(part.works)
+
+    def stopped(self, part: CablePart, rate: float) -> Stopped | None:
+        """Whether it became taut; None of an elastic one."""
+        if self.bilateral:
+            return None
+        size, width = self.num_coordinates, self.measure.weights.shape[1]
+        pull = Memory.of(part.memory, width).tension[:, self.levels[0]]
+        new = (self.before[:, self.levels[0]] == 0.0) & (pull != 0.0)
+        push = np.where(new, -rate * self.step.factor * pull / self.scale, 0.0)
+        lost = np.where(new, part.works["contact_defect"], 0.0)
+        return Stopped(push[:, None] * part.tangent[:, size, :size], lost)
 
     def describe(self, part: Any, flips: Any) -> tuple[float, str]:
         """Its rows, and how often it became taut or slack, or stuck or slipped."""

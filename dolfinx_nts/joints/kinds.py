@@ -15,6 +15,7 @@ import numpy as np
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.joints.between import ROUNDED, Between, Product, Times, Vector
+from dolfinx_nts.joints.directed_friction import Across, DirectedFriction, Turn
 from dolfinx_nts.joints.laws import JointFriction, Motor, cone_limit, laws_on
 from dolfinx_nts.kernels.vectors import triad
 from dolfinx_nts.types import Places
@@ -27,6 +28,7 @@ from dolfinx_nts.validation import (
     known_options,
     number_at,
     require_positive,
+    require_same,
 )
 
 Number = Callable[[float], float]
@@ -43,6 +45,8 @@ class Spherical(Between):
         displacement: Function of time whose change since t = 0 p_A - p_B [m] follows.
         cone: A direction at the start, of any length, and the largest angle [rad] between it in A
             and in B; None: none. Asks for bodies with directions, as those of `Revolute`.
+        friction: `JointFriction` against any turn, with the ball's radius if by coefficient; or
+            None. Asks for the same.
         name: In messages and files; default: kind and bodies.
 
     Raises:
@@ -58,12 +62,20 @@ class Spherical(Between):
         point: Places,
         displacement: Callable[[float], Any] | None = None,
         cone: Any = None,
+        friction: JointFriction | None = None,
         name: str | None = None,
     ) -> None:
         super().__init__(a, b, ("point", point, point), name)
+        self.bearing = 3
         if displacement is not None:
             self.drive("displacement", displacement, "m", at_time)
-        self.parts = cone_limit(self, cone)
+        rubs: tuple[DirectedFriction, ...] = ()
+        require_same(self.comm, friction=friction)
+        if friction is not None:
+            of_a, of_b = self.directions(np.eye(3))
+            vectors = [*of_a, *of_b]
+            rubs = (DirectedFriction(self, "friction", friction, Turn, vectors, self.length),)
+        self.parts = (*cone_limit(self, cone), *rubs)
 
     def products(self, times: Times) -> Iterator[Product]:
         """p_A - p_B = c."""
@@ -299,7 +311,46 @@ class Prismatic(_WithAxis):
 
 @known_options
 class Planar(_WithAxis):
-    """B's point stays in A's plane through `point` with normal `axis`; the normals are parallel."""
+    """B's point stays in A's plane through `point` with normal `axis`; the normals are parallel.
+
+    Args:
+        a: A rigid body, a beam or shell, which it takes at the node there, or None.
+        b: Likewise.
+        point: Of both at the start [m].
+        axis: n at the start, of any length.
+        sliding_friction: `JointFriction` against the way in the plane, or None.
+        turning_friction: As `friction` of `Revolute`; its radius is that of a ring that carries.
+        turning_limits: As `limits` of `Revolute`.
+        turning_motor: As `motor` of `Revolute`.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
+    """
+
+    def __init__(
+        self,
+        a: Body | None,
+        b: Body | None,
+        *,
+        point: Places,
+        axis: Places,
+        sliding_friction: JointFriction | None = None,
+        turning_friction: JointFriction | None = None,
+        turning_limits: Any = None,
+        turning_motor: Motor | None = None,
+        name: str | None = None,
+    ) -> None:
+        super().__init__(a, b, point=point, axis=axis, name=name)
+        self.bearing = 1
+        turning = turning_friction, turning_limits, turning_motor
+        rubs: tuple[DirectedFriction, ...] = ()
+        require_same(self.comm, sliding_friction=sliding_friction)
+        if sliding_friction is not None:
+            given, way = ("sliding_friction", sliding_friction, Across), self.p_b - self.p_a
+            rubs = (DirectedFriction(self, *given, [self.m1_a, self.m2_a, way], 1.0),)
+        self.parts = (*rubs, *laws_on(self, *turning, turns=True, word="turning_"))
 
     def products(self, times: Times) -> Iterator[Product]:
         """n_A . (p_B - p_A) = 0, parallel normals."""

@@ -41,10 +41,10 @@ class JointFriction:
     Attributes:
         bound: Torque [N m], or force [N] along an axis, up to which it sticks.
         coefficient: Of friction mu [-], in place of `bound`: it sticks up to mu R, or the torque
-            mu r R, with R the force of the joint's bearing in the step: of a revolute joint on its
-            point, of what slides along an axis that at right angles to this. Moments that a bearing
-            carries add nothing.
-        radius: Of the pin, r [m]; of what turns.
+            mu r R, with R the force of the joint's bearing in the step: of a revolute
+            or spherical joint on its point, of what slides along an axis that at right angles to
+            this, of a plane that along its normal. Moments that a bearing carries add nothing.
+        radius: Of the pin, the ball or the ring that carries, r [m]; of what turns.
 
     Raises:
         ValueError: A number is not positive, or neither or both of bound and coefficient are given,
@@ -76,7 +76,7 @@ class JointFriction:
             return Bound(float(self.bound))
         assert self.coefficient is not None
         if turns != (self.radius is not None):
-            what = "pass the pin's radius=, too" if turns else "what slides has no radius; drop it"
+            what = "pass its radius=, too" if turns else "what slides has no radius; drop it"
             raise ValueError(f"{name}={self!r}: {what}")
         return Bound(0.0, float(self.coefficient * (self.radius or 1.0)))
 
@@ -262,10 +262,7 @@ def laws_on(
     given = {f"{word}friction": friction, f"{word}limits": limits}
     require_same(joint.comm, **given)
     names = [*given, f"{word}motor"]
-    measure: tuple[Any, Any, float] = (
-        (kernel.Angle, (joint.m1_b, joint.m2_b, joint.m1_a), joint.length)
-        if turns else (kernel.Along, (joint.n_a, joint.p_a - joint.p_b), 1.0)
-    )  # fmt: skip
+    measure = _measure(joint, turns)
     found: list[tuple[str, Any, tuple[str, float]]] = []
     if friction is not None:
         if not isinstance(friction, JointFriction):
@@ -290,6 +287,18 @@ def laws_on(
         OnJoint(joint, name.replace("_", " "), law, entry, *measure)
         for name, law, entry in found
     )
+
+
+def on_joint(joint: Any, *, turns: bool) -> OnJoint:
+    """The angle or the way of a joint with an axis, on which nothing acts."""
+    return OnJoint(joint, "motion", Bound(0.0), ("", 1.0), *_measure(joint, turns))
+
+
+def _measure(joint: Any, turns: bool) -> tuple[Any, tuple[Any, ...], float]:
+    """Kind, vectors and length of what `laws_on` acts on."""
+    if turns:
+        return kernel.Angle, (joint.m1_b, joint.m2_b, joint.m1_a), joint.length
+    return kernel.Along, (joint.n_a, joint.p_a - joint.p_b), 1.0
 
 
 def cone_limit(joint: Any, given: Any) -> tuple[OnJoint, ...]:
@@ -356,11 +365,14 @@ def _asking(joint: Any, argument: str, motor: Motor) -> Callable[..., FloatArray
     """Calls a function for arrays of measures and rates. Collective."""
 
     def of(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
-        pairs = zip(at.ravel(), rate.ravel(), strict=True)
-        found = np.array([float(motor(time, float(a), float(r))) for a, r in pairs])
-        if not np.isfinite(found).all():
-            raise ValueError(f"is not finite: {found.tolist()}")
-        return found.reshape(at.shape)
+        found = np.full(at.shape, np.nan)
+        # An iterate that runs off has no motion to ask about: the step is cut.
+        for k in zip(*np.nonzero(np.isfinite(at) & np.isfinite(rate)), strict=True):
+            value = motor(time, float(at[k]), float(rate[k]))
+            if not is_finite(value):
+                raise ValueError(f"returned {value!r}, which is no finite number [N m] or [N]")
+            found[k] = value
+        return found
 
     def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
         return call_together(

@@ -6,6 +6,7 @@ pairs its arrays go through memory again and again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -191,7 +192,7 @@ class OverSurface(NamedTuple):
         residual: Rows of corners of slave and master, and zeros of the multipliers at the slave's
             corners, shape (elements, r).
         tangent: Its derivative; rows of multipliers are those of the slaves' gap and slips.
-        force: Rows of the points and of the master's corners, shape (n, nc + 1, 3).
+        force: Rows of the points and of the master's corners, if any, shape (n, nc + 1, 3).
         gap: Of the slaves [m], shape (slaves,).
         slip: As vectors [m], shape (slaves, 3).
         pulls: Minus the forces on them, shape (slaves, 3).
@@ -221,17 +222,45 @@ def points_of(element: IntArray, shape: FloatArray, y: FloatArray) -> FloatArray
     return out
 
 
+class Summed(NamedTuple):
+    """How points of a slave's facets are summed up.
+
+    Attributes:
+        element: That of each point, in ascending order, shape (n,).
+        slot: Slaves at the corners of its facet, or -1, shape (n, corners).
+        shape: Weights of the corners in the point, shape (n, corners).
+        share: Its parts in these slaves' gaps, shape (n, corners).
+        multiplier: Of the slaves, lambda_N, with friction forces along two directions, (slaves, m).
+        directions: These, shape (slaves, 2, 3).
+        number: Of elements.
+    """
+
+    element: IntArray
+    slot: IntArray
+    shape: FloatArray
+    share: FloatArray
+    multiplier: FloatArray
+    directions: FloatArray
+    number: int
+
+    def room(self, nc: int) -> OverSurface:
+        """Zeros of what sums have over masters of so many corners."""
+        (slaves, width), (n, corners) = self.multiplier.shape, self.slot.shape
+        size = 3 * (corners + nc) + corners * width
+        shapes = (self.number, size), (self.number, size, size), (n, nc + 1, 3), (slaves,)
+        return OverSurface(*map(np.zeros, (*shapes, (slaves, 3), (slaves, 3))))
+
+    def of_points(self) -> tuple[Any, ...]:
+        """The arrays of points."""
+        numbers = (a.astype(np.int64, copy=False) for a in (self.element, self.slot))
+        return *numbers, self.shape, self.share
+
+
 def over_surface(
     start: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     end: tuple[FloatArray, FloatArray],
     theta: float,
-    element: IntArray,
-    slot: IntArray,
-    shape: FloatArray,
-    share: FloatArray,
-    multiplier: FloatArray,
-    directions: FloatArray,
-    number: int,
+    summed: Summed,
     given: tuple[FloatArray, FloatArray, FloatArray] | None = None,
 ) -> OverSurface:
     """Elements of points of a slave's facets, summed up in pairs of facets and in slaves.
@@ -240,29 +269,37 @@ def over_surface(
         start: x0, normal0, xi0 and length as of `condensed`.
         end: x1 and xi1 as of `condensed`.
         theta: Where between t_n and t_{n+1} friction acts.
-        element: That of each point, in ascending order, shape (n,).
-        slot: Slaves at the corners of its facet, or -1, shape (n, corners).
-        shape: Weights of the corners in the point, shape (n, corners).
-        share: Its parts in these slaves' gaps, shape (n, corners).
-        multiplier: Of the slaves, lambda_N, with friction forces along two directions, (slaves, m).
-        directions: These, shape (slaves, 2, 3).
-        number: Of elements.
+        summed: How.
         given: Residual, tangent and gradient of the slip of each point, where its rule is not the
             mean value.
     """
-    (slaves, width), (n, corners) = multiplier.shape, slot.shape
-    nc = end[0].shape[1] - 1
-    size = 3 * (corners + nc) + corners * width
-    shapes = (number, size), (number, size, size), (n, nc + 1, 3), (slaves,), (slaves, 3)
-    out = OverSurface(*map(np.zeros, (*shapes, (slaves, 3))))
+    nc, (n, corners) = end[0].shape[1] - 1, summed.slot.shape
+    out = summed.room(nc)
     points = nts_element.GAUSS_POINTS[nc]
-    rule = points, *discrete_gradient.gauss(points), width - 1, theta, corners, n
+    tangential = summed.multiplier.shape[1] - 1
+    rule = points, *discrete_gradient.gauss(points), tangential, theta, corners, n
     x0, normal0, xi0, length = start
-    numbers = (a.astype(np.int64, copy=False) for a in (element, slot))
-    of_points = *numbers, shape, share, x0, end[0], normal0, xi0, end[1], length
+    of_points = *summed.of_points(), x0, end[0], normal0, xi0, end[1], length
     own = given or (None,) * 3
-    kernel = library.load().over_surface
-    library.run(kernel, _facet(nc)[0], *rule, *of_points, multiplier, directions, *own, *out)
+    kernel, carried = library.load().over_surface, (summed.multiplier, summed.directions)
+    library.run(kernel, _facet(nc)[0], *rule, *of_points, *carried, *own, *out)
+    return out
+
+
+def over_obstacle(along: FloatArray, given: Sequence[Any], summed: Summed) -> OverSurface:
+    """The same of points and an obstacle.
+
+    Args:
+        along: Directions of the points' slips, shape (n, 2, 3).
+        given: Residual, tangent, and with friction value and gradient of the slip, of each point,
+            as of `compiled_law.obstacle`.
+        summed: How.
+    """
+    out, (n, corners) = summed.room(0), summed.slot.shape
+    kernel, tangential = library.load().over_obstacle, summed.multiplier.shape[1] - 1
+    own = [*given[:4], None, None][:4]
+    carried = summed.multiplier, summed.directions, along
+    library.run(kernel, tangential, corners, n, *summed.of_points(), *carried, *own, *out)
     return out
 
 

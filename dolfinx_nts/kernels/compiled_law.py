@@ -87,7 +87,7 @@ class Obeyed(NamedTuple):
 
 def laws(
     law: tuple[Any, list[Any]],
-    together: tuple[float, float, float],
+    together: tuple[FloatArray | float, FloatArray | float, FloatArray | float],
     residual: FloatArray,
     tangent: FloatArray,
     gap: FloatArray,
@@ -120,9 +120,12 @@ def laws(
         np.empty(n, dtype=bool), np.empty(n, dtype=bool), np.empty(n), np.empty((n, 3)),
         np.zeros((n, 3)),
     )  # fmt: skip
+    of_each = np.empty((n, 3))
+    for k, value in enumerate(together):
+        of_each[:, k] = value
     both = slip or (None,) * 4
     given = gap, *both, multiplier, held, normal, let_go
-    library.run(library.load().laws, law[0], library.Together(*together), n, *given, *out)
+    library.run(library.load().laws, law[0], of_each, n, *given, *out)
     return out
 
 

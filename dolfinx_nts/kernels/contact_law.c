@@ -217,7 +217,7 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
         if (law->gap_width > 0.0 && !(let_go && let_go[i]))
             active[i] = blur_gap(law, last[0], of_end, law->yielding[i], r, k, &press);
         else if (active[i])
-            gap_row[row] -= together->normal / scale;
+            gap_row[row] -= together[i].normal / scale;
         if (active[i] || (law->gap_width > 0.0 && !(let_go && let_go[i]))) {
             if (law->hardly > 0.0)
                 rub_hardly(law, &slip, last, of_end, scale, law->yielding[i], r, k);
@@ -225,7 +225,7 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
                 stick[i] = blur_slip(law, law->coefficients ? law->coefficients[i] : law->coefficient, &slip, last,
                                      of_end, scale, &press, r, k);
             else if (law->friction)
-                stick[i] = rub(law, i, together, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
+                stick[i] = rub(law, i, together + i, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
                                unmoved ? held + 4 * i : NULL, r, k);
         } else {
             r[row] = last[0] / scale;

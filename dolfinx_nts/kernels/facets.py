@@ -24,30 +24,32 @@ from dolfinx_nts.kernels.vectors import cross, solve_2x2
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 EPS = float(np.finfo(np.float64).eps)
+#: Of the corners of a quadrilateral: derivatives by xi and eta in the middle, and by both.
+_BILINEAR = 0.25 * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]], dtype=float)
 
 # Newton converges quadratically, so the step after one of this size is at round-off.
 LAST_STEP = 1e-10
 _MAX_NEWTON = 60
 _MAX_HALVINGS = 40
 
-_REFERENCE = {
+CORNERS = {
     3: np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
     4: np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]),
 }
 #: Modules of smooth patches by the number of control points.
 _SMOOTH = {p.NUM_POINTS: p for p in (patches, triangle_patches)}
-# Exact for what the facets need: integrals of N_I over a flat triangle, and over a parallelogram.
-_QUADRATURE = {
-    3: (np.array([[1.0, 1.0]]) / 3.0, np.array([0.5])),
-    4: (_REFERENCE[4] / np.sqrt(3.0), np.ones(4)),
+#: Points and weights, exact for degree 2, on quadrilaterals for 3 in each direction.
+QUADRATURE = {
+    3: (np.array([[1.0, 1.0], [4.0, 1.0], [1.0, 4.0]]) / 6.0, np.full(3, 1.0 / 6.0)),
+    4: (CORNERS[4] / np.sqrt(3.0), np.ones(4)),
 }
 
 
 def _reference(nc: int) -> FloatArray:
     """Reference corners [-], shape (nc, 2), or an error that names the supported kinds."""
-    if nc not in _REFERENCE:
+    if nc not in CORNERS:
         raise ValueError(f"A facet has 3 (triangle) or 4 (quadrilateral) corners, not {nc}.")
-    return _REFERENCE[nc]
+    return CORNERS[nc]
 
 
 def shape(xi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -135,11 +137,34 @@ def edge_excess(xi: FloatArray, nc: int) -> FloatArray:
     return 2.0 * np.column_stack([-b, a + b - 1.0, -a])
 
 
+def turned_over(corners: FloatArray, xi: FloatArray) -> BoolArray:
+    """Which facets face the other way where coordinates lie, far beyond an edge, shape (n,).
+
+    A quadrilateral whose corners are in no plane goes on bent, and what projects onto it where it
+    has turned over may be anywhere; triangles are flat, and smooth patches have neighbours.
+
+    Args:
+        corners: Facet corners or control points [m], shape (n, nc, 3).
+        xi: Convective coordinates [-], shape (n, 2).
+    """
+    found = np.zeros(len(xi), dtype=bool)
+    if corners.shape[1] != 4:
+        return found
+    beyond = np.flatnonzero((np.abs(xi) > 1.0).any(axis=1))
+    if beyond.size:
+        along, across, bent = (_BILINEAR @ corners[beyond]).swapaxes(0, 1)
+        # The normal is (along + eta bent) x (across + xi bent).
+        middle, at = cross(along, across), xi[beyond, :, None]
+        more = cross(middle, at[:, 0] * along - at[:, 1] * across)
+        found[beyond] = (middle * middle + bent * more).sum(axis=1) <= 0.0
+    return found
+
+
 def _shares(corners: FloatArray) -> FloatArray:
     """Integral of each N_I over its facet [m^2], shape (n, nc)."""
     nc = corners.shape[1]
     _reference(nc)
-    points, weights = _QUADRATURE[nc]
+    points, weights = QUADRATURE[nc]
     values, first, _ = shape(points, nc)
     tangents = np.einsum("gia,nij->ngaj", first, corners)
     jacobian = np.linalg.norm(np.cross(tangents[:, :, 0], tangents[:, :, 1]), axis=2)
@@ -189,7 +214,7 @@ def _modes(start: FloatArray, spans: FloatArray) -> FloatArray:
     """Vectors of xbar - x = c_0 + c_1 s + c_2 t + c_3 s t [m], shape (4, 3, n)."""
     if spans.shape[1] == 3:
         return np.stack([start.T, spans[:, 1].T, spans[:, 2].T, np.zeros(start.T.shape)])
-    s, t = _REFERENCE[4].T
+    s, t = CORNERS[4].T
     corners = spans.transpose(1, 2, 0).reshape(4, -1)
     c = (0.25 * np.array([np.ones(4), s, t, s * t]) @ corners).reshape(4, 3, -1)
     c[0] += start.T

@@ -99,12 +99,6 @@ class FieldTable(ctypes.Structure):
     ]
 
 
-class Together(ctypes.Structure):
-    """What pairs have in common; see `contact_law.c`."""
-
-    _fields_ = [("force", _REAL), ("normal", _REAL), ("tangential", _REAL)]  # noqa: RUF012
-
-
 #: Arguments of the loop in `cell_batches.c`.
 ASSEMBLE = (_LONG, *(_ARRAY,) * 3, _INT, *(_ARRAY,) * 3)
 _FACET, _LIMITS = ctypes.POINTER(Facet), ctypes.POINTER(Limits)
@@ -131,8 +125,9 @@ _KERNELS = {
         *(_FACET, _INT, _ARRAY, _ARRAY, _INT, _REAL, _INT, _LONG),
         *(_ARRAY,) * 21,
     ),
+    "over_obstacle": (_INT, _INT, _LONG, *(_ARRAY,) * 17),
     "law_of_sums": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 5),
-    "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 17),
+    "laws": (ctypes.POINTER(Law), _ARRAY, _LONG, *(_ARRAY,) * 17),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),

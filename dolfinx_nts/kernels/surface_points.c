@@ -15,8 +15,9 @@ void points_of(int corners, int nc, long n, const long *element, const double *s
     }
 }
 
-/* What a point has by its y as what it has by corners of slave and master. */
-INLINE void spread(int corners, int nc, const double *restrict shape, const double *restrict by_y, double *restrict out)
+/* What a point has by its y as what it has by corners of the slave and so many of the master. */
+INLINE void spread(int corners, int nc, int others, const double *restrict shape, const double *restrict by_y,
+                   double *restrict out)
 {
     double total[3] = {0.0};
     for (int i = 0; i < nc; i++)
@@ -25,17 +26,19 @@ INLINE void spread(int corners, int nc, const double *restrict shape, const doub
     for (int a = 0; a < corners; a++)
         for (int k = 0; k < 3; k++)
             out[3 * a + k] = shape[a] * total[k];
-    memcpy(out + 3 * corners, by_y, 3 * nc * sizeof(double));
+    memcpy(out + 3 * corners, by_y, 3 * others * sizeof(double));
 }
 
 /* tangent += the point's stiffness */
-INLINE void add_stiffness(int corners, int nc, const double *shape, const Pair *pair, int width, double *tangent)
+INLINE void add_stiffness(int corners, int nc, int others, const double *shape, const Pair *pair, int width,
+                          double *tangent)
 {
-    int size = 3 * (corners + nc);
+    int size = 3 * (corners + others);
     double row[ROWS], total[3][ROWS] = {{0.0}};
     for (int i = 0; i < 3 * nc; i++) {
-        spread(corners, nc, shape, pair->stiffness[i], row);
-        axpy(size, 1.0, row, tangent + (3 * corners + i) * width);
+        spread(corners, nc, others, shape, pair->stiffness[i], row);
+        if (i < 3 * others)
+            axpy(size, 1.0, row, tangent + (3 * corners + i) * width);
         axpy(size, -1.0, row, total[i % 3]);
     }
     for (int a = 0; a < corners; a++)
@@ -44,15 +47,15 @@ INLINE void add_stiffness(int corners, int nc, const double *shape, const Pair *
 }
 
 /* As in nts_element.c. */
-static void four_on_four(int corners, int nc, const double *shape, const Pair *pair, int width, double *tangent)
+static void four_on_four(int corners, int nc, int others, const double *shape, const Pair *pair, int width, double *tangent)
 {
-    (void)corners, (void)nc;
-    add_stiffness(4, 4, shape, pair, width, tangent);
+    (void)corners, (void)nc, (void)others;
+    add_stiffness(4, 4, 4, shape, pair, width, tangent);
 }
 
-static void any_on_any(int corners, int nc, const double *shape, const Pair *pair, int width, double *tangent)
+static void any_on_any(int corners, int nc, int others, const double *shape, const Pair *pair, int width, double *tangent)
 {
-    add_stiffness(corners, nc, shape, pair, width, tangent);
+    add_stiffness(corners, nc, others, shape, pair, width, tangent);
 }
 
 /* What a point has of friction: directions a_a over the facet's size halfway, and their change by the
@@ -137,6 +140,90 @@ static void make(const Rule *rule, Place *p, double normal, const double *t, dou
         }
 }
 
+/* Where what points have is summed up: slaves at the corners of the facet, < 0 where there is none, with
+   shares C and shape functions of its corners; control points, others of which have rows. */
+typedef struct {
+    int corners, nc, others, tangential;
+    const long *slot;
+    const double *shape, *share, *multiplier, *directions;
+    double *residual, *tangent, *force, *gap, *slip, *pulls;
+} Total;
+
+/* The normal multiplier and the friction of a point. */
+static double carried(const Total *to, double *pull)
+{
+    int each = 1 + to->tangential;
+    double normal = 0.0;
+    memset(pull, 0, 3 * sizeof(double));
+    for (int c = 0; c < to->corners; c++) {
+        long slave = to->slot[c];
+        if (slave < 0)
+            continue;
+        normal += to->share[c] * to->multiplier[slave * each];
+        for (int m = 0; m < to->tangential; m++)
+            axpy(3, to->share[c] * to->multiplier[slave * each + 1 + m], to->directions + 3 * (2 * slave + m), pull);
+    }
+    return normal;
+}
+
+/* Add what a point has that carries so much. */
+static void sum_up(const Total *to, Point *point, const Middle *middle, double normal, const double *pull)
+{
+    int nc = to->nc, count = 3 * nc, corners = to->corners, others = to->others, size = 3 * (corners + others),
+        each = 1 + to->tangential, width = size + corners * each;
+    double row[ROWS], column[ROWS], change[2][WIDTH], t[2] = {0.0}, *k = to->tangent;
+    Pair *pair = &point->pair;
+    for (int a = 0; a < to->tangential; a++)
+        t[a] = dot(middle->along[a], pull);
+    if (to->tangential)
+        turns_of(nc, middle, (const double(*)[WIDTH])point->slip, pull, change);
+    for (int a = 0; a < to->tangential; a++)
+        for (int j = 0; j < count; j++)
+            axpy(count, pair->by_slip[a][j], change[a], pair->stiffness[j]);
+    spread(corners, nc, others, to->shape, pair->force, row);
+    axpy(size, 1.0, row, to->residual);
+    memset(to->force, 0, 3 * sizeof(double));
+    memcpy(to->force + 3, pair->force, 3 * others * sizeof(double));
+    for (int j = 0; j < count; j++)
+        to->force[j % 3] -= pair->force[j];
+    if (normal != 0.0 || t[0] != 0.0 || t[1] != 0.0)
+        (corners == 4 && others == 4 ? four_on_four : any_on_any)(corners, nc, others, to->shape, pair, width, k);
+    for (int m = 0; m < each; m++)
+        for (int c = 0; c < corners; c++) {
+            long slave = to->slot[c];
+            int at = size + c * each + m;
+            if (slave < 0)
+                continue;
+            if (m) {
+                const double *v = to->directions + 3 * (2 * slave + m - 1);
+                double by_y[WIDTH] = {0.0}, by_own[WIDTH] = {0.0};
+                turns_of(nc, middle, (const double(*)[WIDTH])point->slip, v, change);
+                for (int a = 0; a < 2; a++) {
+                    axpy(count, dot(middle->along[a], v), pair->by_slip[a], by_own);
+                    axpy(count, dot(middle->along[a], v), point->slip[a], by_y);
+                    axpy(count, middle->slip[a], change[a], by_y);
+                }
+                spread(corners, nc, others, to->shape, by_y, row);
+                spread(corners, nc, others, to->shape, by_own, column);
+            } else if (c == 0 || to->slot[c - 1] < 0) {
+                spread(corners, nc, others, to->shape, point->rise, row);
+                spread(corners, nc, others, to->shape, pair->by_normal, column);
+            }
+            axpy(size, to->share[c], row, k + at * width);
+            for (int j = 0; j < size; j++)
+                k[j * width + at] += to->share[c] * column[j];
+            for (int j = 0; j < 3 * corners; j++)
+                to->pulls[3 * slave + j % 3] += to->share[c] * to->multiplier[slave * each + m] * column[j];
+        }
+    for (int c = 0; c < corners; c++) {
+        if (to->slot[c] < 0)
+            continue;
+        to->gap[to->slot[c]] += to->share[c] * pair->gap;
+        for (int a = 0; a < to->tangential; a++)
+            axpy(3, to->share[c] * middle->slip[a], middle->along[a], to->slip + 3 * to->slot[c]);
+    }
+}
+
 /* Points (n,) in elements, in ascending order; slaves at their corners, < 0 where there is none, with
    shares C, shape functions (n, corners). Of slaves lambda_N, or lambda_N and forces along two directions
    (slaves, 2, 3). Other rules than the mean value give residual, tangent and gradient of the slip of points
@@ -151,23 +238,16 @@ void over_surface(const Facet *facet, int points, const double *tau, const doubl
                   double *tangent, double *force, double *gap, double *slip, double *pulls)
 {
     Rule rule = {*facet, points, tangential, tau, weight};
-    int nc = facet->nc, count = 3 * nc, places = count + 3, size = 3 * (corners + nc), each = 1 + tangential,
-        width = size + corners * each, own = places + each;
+    int nc = facet->nc, places = 3 * nc + 3, width = 3 * (corners + nc) + corners * (1 + tangential),
+        own = places + 1 + tangential;
+    Total to = {corners, nc, nc, tangential, slot, shapes, shares, multiplier, directions, 0, 0, force, gap, slip, pulls};
     Place p;
     Point point;
-    Pair *pair = &point.pair;
     Middle middle;
-    for (long i = 0; i < n; i++, slot += corners, shapes += corners, shares += corners, force += places) {
-        double normal = 0.0, pull[3] = {0.0}, t[2] = {0.0}, row[ROWS], column[ROWS], change[2][WIDTH];
-        double *r = residual + element[i] * width, *k = tangent + element[i] * width * width;
+    for (long i = 0; i < n; i++, to.slot += corners, to.shape += corners, to.share += corners, to.force += places) {
+        double pull[3], t[2] = {0.0}, normal = carried(&to, pull);
+        to.residual = residual + element[i] * width, to.tangent = tangent + element[i] * width * width;
         place_of(nc, x0 + i * places, x1 + i * places, d0 + 3 * i, f0 + 2 * i, f1 + 2 * i, &p);
-        for (int c = 0; c < corners; c++) {
-            if (slot[c] < 0)
-                continue;
-            normal += shares[c] * multiplier[slot[c] * each];
-            for (int m = 0; m < tangential; m++)
-                axpy(3, shares[c] * multiplier[slot[c] * each + 1 + m], directions + 3 * (2 * slot[c] + m), pull);
-        }
         if (tangential)
             middle_of(&rule, &p, theta, length[i], &middle);
         for (int a = 0; a < tangential; a++)
@@ -176,51 +256,42 @@ void over_surface(const Facet *facet, int points, const double *tau, const doubl
             take(nc, tangential, own_residual + i * own, own_tangent + i * own * own, own_slip + 2 * i * own, &point);
         else
             make(&rule, &p, normal, t, length[i], &point);
-        if (tangential)
-            turns_of(nc, &middle, (const double(*)[WIDTH])point.slip, pull, change);
-        for (int a = 0; a < tangential; a++)
-            for (int j = 0; j < count; j++)
-                axpy(count, pair->by_slip[a][j], change[a], pair->stiffness[j]);
-        spread(corners, nc, shapes, pair->force, row);
-        axpy(size, 1.0, row, r);
-        memcpy(force + 3, pair->force, count * sizeof(double));
-        for (int j = 0; j < count; j++)
-            force[j % 3] -= pair->force[j];
-        if (normal != 0.0 || t[0] != 0.0 || t[1] != 0.0)
-            (corners == 4 && nc == 4 ? four_on_four : any_on_any)(corners, nc, shapes, pair, width, k);
-        for (int m = 0; m < each; m++)
-            for (int c = 0; c < corners; c++) {
-                int at = size + c * each + m;
-                if (slot[c] < 0)
-                    continue;
-                if (m) {
-                    const double *v = directions + 3 * (2 * slot[c] + m - 1);
-                    double by_y[WIDTH] = {0.0}, by_own[WIDTH] = {0.0};
-                    turns_of(nc, &middle, (const double(*)[WIDTH])point.slip, v, change);
-                    for (int a = 0; a < 2; a++) {
-                        axpy(count, dot(middle.along[a], v), pair->by_slip[a], by_own);
-                        axpy(count, dot(middle.along[a], v), point.slip[a], by_y);
-                        axpy(count, middle.slip[a], change[a], by_y);
-                    }
-                    spread(corners, nc, shapes, by_y, row);
-                    spread(corners, nc, shapes, by_own, column);
-                } else if (c == 0 || slot[c - 1] < 0) {
-                    spread(corners, nc, shapes, point.rise, row);
-                    spread(corners, nc, shapes, pair->by_normal, column);
-                }
-                axpy(size, shares[c], row, k + at * width);
-                for (int j = 0; j < size; j++)
-                    k[j * width + at] += shares[c] * column[j];
-                for (int j = 0; j < 3 * corners; j++)
-                    pulls[3 * slot[c] + j % 3] += shares[c] * multiplier[slot[c] * each + m] * column[j];
+        sum_up(&to, &point, &middle, normal, pull);
+    }
+}
+
+/* The same of points and an obstacle, by residual, tangent and slip of `obstacle`, slip along directions that do
+   not turn (n, 2, 3): the obstacle is a control point without rows, with minus what the slave has. */
+void over_obstacle(int tangential, int corners, long n, const long *element, const long *slot, const double *shapes,
+                   const double *shares, const double *multiplier, const double *directions, const double *along,
+                   const double *own_residual, const double *own_tangent, const double *own_value,
+                   const double *own_slip, double *residual, double *tangent, double *force, double *gap,
+                   double *slip, double *pulls)
+{
+    int each = 1 + tangential, own = 3 + each, width = corners * (3 + each);
+    Total to = {corners, 1, 0, tangential, slot, shapes, shares, multiplier, directions, 0, 0, force, gap, slip, pulls};
+    for (long i = 0; i < n; i++, to.slot += corners, to.shape += corners, to.share += corners, to.force += 3) {
+        const double *r = own_residual + i * own, *k = own_tangent + i * own * own;
+        double pull[3], normal = carried(&to, pull);
+        Middle middle = {{{0.0}}};
+        Point point;
+        to.residual = residual + element[i] * width, to.tangent = tangent + element[i] * width * width;
+        point.pair.gap = r[3];
+        for (int a = 0; a < 3; a++) {
+            point.pair.force[a] = -r[a];
+            point.pair.by_normal[a] = -k[a * own + 3];
+            point.rise[a] = -k[3 * own + a];
+            memcpy(point.pair.stiffness[a], k + a * own, 3 * sizeof(double));
+            for (int b = 0; b < tangential; b++) {
+                point.pair.by_slip[b][a] = -k[a * own + 4 + b];
+                point.slip[b][a] = -own_slip[(2 * i + b) * own + a];
             }
-        for (int c = 0; c < corners; c++) {
-            if (slot[c] < 0)
-                continue;
-            gap[slot[c]] += shares[c] * pair->gap;
-            for (int a = 0; a < tangential; a++)
-                axpy(3, shares[c] * middle.slip[a], middle.along[a], slip + 3 * slot[c]);
         }
+        if (tangential) {
+            memcpy(middle.along, along + 6 * i, sizeof middle.along);
+            memcpy(middle.slip, own_value + 2 * i, sizeof middle.slip);
+        }
+        sum_up(&to, &point, &middle, normal, pull);
     }
 }
 

@@ -15,7 +15,7 @@ from dolfinx_nts.bodies.solid.inversion import smallest_dets
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.parallel import Asking, global_sum, together
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import BalanceRow, FloatArray
@@ -57,6 +57,18 @@ def _losses(system: System) -> tuple[str, ...]:
     """Columns for energy that leaves through joints and bodies."""
     owners = (*system.joints, *system.bodies)
     return tuple(dict.fromkeys(name for owner in owners for name in owner.losses))
+
+
+#: End of the names of columns that have of a column the part of each declared joint.
+OF_JOINTS = " of joints"
+
+
+def told_by(system: System) -> tuple[str, ...]:
+    """Columns that joints may tell works of, none without joints."""
+    if not system.declared_joints:
+        return ()
+    own = (name for joint in system.joints for name in joint.losses)
+    return ("external_work", "friction_dissipation", "contact_defect", *dict.fromkeys(own))
 
 
 #: Columns that add up over the steps, and those that count in a step.
@@ -142,6 +154,13 @@ def measure(
     Returns:
         kinetic, potential, linear_momentum (3,), angular_momentum (3,).
     """
+    return together(system.comm, [measuring(system, state, known)])[0]
+
+
+def measuring(
+    system: System, state: State, known: dict[str, Measured] | None = None
+) -> Asking[dict[str, Any]]:
+    """`measure` as of `parallel.together`."""
     local, known = np.zeros(8), {} if known is None else known
     before = system.take_inner(state.inner)
     for body, u, v in _ends(system, state):
@@ -155,8 +174,7 @@ def measure(
             local[1] += joint.potential([state.u[b] for b in bodies], history)
     # The state may be one that is dropped.
     system.take_inner(before)
-    total = np.empty_like(local)
-    system.comm.Allreduce(local, total, op=MPI.SUM)
+    total, _ = yield local, np.empty(0)
     return {
         "kinetic": float(total[0]),
         "potential": float(total[1]),
@@ -165,13 +183,12 @@ def measure(
     }
 
 
-def momenta(system: System, state: State) -> dict[str, FloatArray]:
-    """Momenta of a state [kg m/s, kg m^2/s], as `measure` has them. Collective."""
+def momenta(system: System, state: State) -> Asking[dict[str, FloatArray]]:
+    """Momenta of a state [kg m/s, kg m^2/s], as `measure` has them, as of `parallel.together`."""
     local = np.zeros(6)
     for body, u, v in _ends(system, state):
         local += np.concatenate(_momenta(body, u, body.inertia(v)))
-    total = np.empty_like(local)
-    system.comm.Allreduce(local, total, op=MPI.SUM)
+    total, _ = yield local, np.empty(0)
     return {"linear_momentum": total[:3], "angular_momentum": total[3:]}
 
 
@@ -193,8 +210,8 @@ def _momenta(body: Body, u: FloatArray, momentum: FloatArray) -> tuple[FloatArra
     return body.linear_momentum(momentum), body.angular_momentum(u, momentum)
 
 
-def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
-    """Works and counts of an accepted step, the same on all ranks. Collective.
+def step_terms(problem: StepProblem, step: Evaluation) -> Asking[dict[str, Any]]:
+    """Works and counts of an accepted step, the same on all ranks, as of `parallel.together`.
 
     Loads and supports do external work; what elements and bodies add, they name, see
     `Elements.ledger` and `Body.lost`.
@@ -202,6 +219,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     Returns:
         By columns of the balance table: works [J] and counts of the step, min_gap [m] (infinite
         without candidates), min_det (infinite without flexible bodies; see `Body.smallest_det`).
+        And the works of each joint, see `OF_JOINTS`.
     """
     scale = 1.0 / problem.factor
     losses = _losses(problem.system)
@@ -212,19 +230,25 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
         sums["external_work"] += work + problem.supports.work(k, terms, problem.factor)
     for name, lost in _lost_by_bodies(problem, step):
         sums[name] += lost
-    for elements, part in zip(problem.elements, step.parts, strict=True):
+    touching = problem.elements[: problem.couplings.num_touching]
+    for elements, part in zip(touching, step.parts, strict=False):
         for name, value in elements.ledger(part, problem.factor).items():
             sums[name] += value
+    by_joints = told_by_joints(problem, step)
+    for name, works in by_joints.items():
+        sums[name] += float(works.sum())
     for coupling, parts in problem.couplings.each(step):
         for name, value in coupling.smallest(parts).items():
             smallest[name] = min(smallest[name], value)
-    comm = problem.system.comm
-    total = global_sum(comm, np.array(list(sums.values())))
+    told, declared = told_by(problem.system), len(problem.system.declared_joints)
+    own = np.concatenate([list(sums.values()), *(by_joints[name][:declared] for name in told)])
     least = np.array(list(smallest.values()))
-    comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+    total, lowest = yield own, -least
+    of_joints = total[len(sums) :].reshape(len(told), declared)
     return {
-        **dict(zip(sums, total.tolist(), strict=True)),
-        **dict(zip(smallest, least.tolist(), strict=True)),
+        **dict(zip(sums, total.tolist(), strict=False)),
+        **dict(zip((name + OF_JOINTS for name in told), of_joints, strict=True)),
+        **dict(zip(smallest, (-lowest).tolist(), strict=True)),
         "min_det": step.min_det,
     }
 
@@ -250,18 +274,23 @@ def _lost_by_bodies(problem: StepProblem, step: Evaluation) -> Iterator[tuple[st
         body.begin_step(rule, moment)
 
 
-def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
-    """External work of an accepted step by elements, of each joint on this rank [J], (joints,)."""
-    work = np.zeros(len(problem.system.joints))
-    for coupling, (k, *_), parts in problem.couplings.of_joints(step):
-        # Several that are evaluated together prescribe nothing.
+def told_by_joints(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
+    """Works of an accepted step by elements, of each joint on this rank [J], shape (joints,)."""
+    count = len(problem.system.joints)
+    works = {name: np.zeros(count) for name in told_by(problem.system)}
+    for coupling, numbers, parts in problem.couplings.of_joints(step):
         for batch, part in zip(coupling.elements, parts, strict=True):
-            work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
-    return work
+            for name, value in batch.ledger(part, problem.factor).items():
+                of = works.setdefault(name, np.zeros(count))
+                if len(numbers) > 1:
+                    np.add.at(of, np.array(numbers)[batch.joint], batch.works(part, problem.factor))
+                else:
+                    of[numbers[0]] += value
+    return works
 
 
-def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch]:
-    """Changes of facet in an accepted step, the same on all ranks. Every rank must call it."""
+def switches(problem: StepProblem, step: Evaluation, time: float) -> Asking[list[Switch]]:
+    """Changes of facet in an accepted step, the same on all ranks, as of `parallel.together`."""
     if not problem.system.contacts:
         return []
     found = []
@@ -273,7 +302,7 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
             facets = (int(before[i]), int(c.facet[i]))
             node = contact.input_node(i)
             found.append(Switch(time, contact.name, node, facets, -float(gain[i])))
-    gathered = problem.system.comm.allgather(found)
+    gathered = problem.system.comm.allgather(found) if (yield bool(found)) else []
     return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
 
 
@@ -290,6 +319,16 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
             text = f"{gain[i]:.3g} by {where}, deep by {-contact.candidates.gap[i]:.3g}"
             best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]
+
+
+def largest_loss(problem: StepProblem, step: Evaluation) -> str:
+    """The contact or joint whose touches take most energy in a step; "": none. Collective."""
+    losses = {"": 0.0}
+    for elements, part in zip(problem.elements, step.parts, strict=True):
+        lost = elements.ledger(part, problem.factor).get("contact_defect", 0.0)
+        losses[elements.name] = losses.get(elements.name, 0.0) + lost
+    total = global_sum(problem.system.comm, np.array(list(losses.values())))
+    return list(losses)[int(total.argmax())]
 
 
 def first_row(system: System, state: State) -> dict[str, Any]:
@@ -311,11 +350,13 @@ def first_row(system: System, state: State) -> dict[str, Any]:
 def unknown_row(system: System) -> dict[str, Any]:
     """Balance table row of a step without a ledger."""
     row: dict[str, Any] = dict.fromkeys(columns(system), np.nan)
+    none = np.full(len(system.declared_joints), np.nan)
+    row |= {name + OF_JOINTS: none for name in told_by(system)}
     return row | dict.fromkeys(("linear_momentum", "angular_momentum"), np.full(3, np.nan))
 
 
 def next_row(
-    first: float, last: BalanceRow, measured: BalanceRow, terms: Mapping[str, float]
+    first: float, last: BalanceRow, measured: BalanceRow, terms: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Row of an accepted step; work, dissipation, defect and ledger residual are cumulative.
 
@@ -326,8 +367,9 @@ def next_row(
         terms: `step_terms` of the step.
     """
     row = {**last, **measured, **terms}
-    losses = [name for name in terms if name not in COLUMNS]
-    for name in (*WORKS, *CHANGES, *losses):
+    more = [name for name in terms if name not in COLUMNS]
+    losses = [name for name in more if not name.endswith(OF_JOINTS)]
+    for name in (*WORKS, *CHANGES, *more):
         row[name] = last[name] + terms.get(name, 0.0)
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (

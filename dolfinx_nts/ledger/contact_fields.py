@@ -118,7 +118,7 @@ def at_nodes(
         if pair.slave.body is body:
             own = state.contacts[k]
             first = np.where(own.force > 0.0, own.force, -own.gap)
-            area = system.slave_areas[k]
+            area = system.slave_area(k, state)
             press = own.force if loads is None else loads.pressing(k, own.force)
             for name, (elsewhere, values) in _of_slave(pair, own, press, area).items():
                 fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values, first)

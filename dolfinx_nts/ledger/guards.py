@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 
-from mpi4py import MPI
-
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.state import State
-from dolfinx_nts.types import BalanceRow
+from dolfinx_nts.types import BalanceRow, FloatArray
 from dolfinx_nts.validation import StepFailedError
 
 #: Part of the momenta and impulses of a step by which momentum may change without an impulse ...
@@ -27,13 +26,9 @@ _SQUARED_AWAY = math.sqrt(float(np.finfo(float).tiny))
 
 
 def check_momentum(
-    problem: StepProblem,
-    step: Evaluation,
-    state: State,
-    before: BalanceRow,
-    after: BalanceRow,
+    problem: StepProblem, pushed: FloatArray, before: BalanceRow, after: BalanceRow
 ) -> float:
-    """Refuse a step whose momentum changes by more than its impulses. Every rank must call it.
+    """Refuse a step whose momentum changes by more than its impulses.
 
     Linear momentum changes by the impulses of loads, supports and obstacles alone, angular
     momentum, where the integrator keeps it, by their moments at the middle of the step. The
@@ -42,10 +37,9 @@ def check_momentum(
 
     Args:
         problem: Equations of the step.
-        step: Their solution.
-        state: The state it leads to.
+        pushed: `pushes` of their solution.
         before: `balance.measure` of the state at t_n.
-        after: `balance.measure` of `state`.
+        after: `balance.measure` of the state it leads to.
 
     Returns:
         Impulses of all forces in the step, the sum of their absolute values [kg m/s].
@@ -53,30 +47,7 @@ def check_momentum(
     Raises:
         StepFailedError: The step is wrong.
     """
-    local, rule, dt, batches = np.zeros(16), problem.integrator, problem.dt, problem.batches
-    old = zip(batches.join(problem.state.u), *batches.rates(problem.state), strict=True)
-    each = zip(batches.bodies, batches.numbers, step.terms, old, batches.join(state.v), strict=True)
-    for body, (k, *_), terms, (u0, v0, a0), v1 in each:
-        force = terms.external - terms.internal - terms.coupling
-        force[body.fixed] += terms.residual[body.fixed]
-        local[:3] += body.linear_momentum(force)
-        local[3:6] += body.angular_momentum(u0 + 0.5 * terms.du, force)
-        parts = (terms.internal, terms.external, terms.coupling)
-        local[6] += sum(float(np.abs(p).sum()) for p in parts)
-        speed = np.abs(v0) + np.abs(v1)
-        if rule.accelerations:
-            # What the velocity would be without the forces of this step.
-            free = problem.supports.coast(k, v0, a0)
-            local[9:12] += body.linear_momentum(body.inertia(free - v0))
-            speed += np.abs(free)
-        local[13:] += problem.supports.bend(k, terms.du)
-        local[7] += float(np.abs(body.nodal_mass) @ speed)
-        local[8] += float(terms.du @ terms.du)
-    for batch, part in zip(problem.elements, step.parts, strict=True):
-        # Of forces that cancel each other within a body only the rounding counts.
-        local[12] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
-    total = np.empty_like(local)
-    problem.system.comm.Allreduce(local, total, op=MPI.SUM)
+    total, rule, dt = pushed.copy(), problem.integrator, problem.dt
     arm = problem.lengths.span + math.sqrt(total[8])
     total[:7] *= rule.rate(dt)
     activity = total[6] + total[7]
@@ -99,3 +70,36 @@ def check_momentum(
                 "solved, whatever their residual says"
             )
     return float(total[6])
+
+
+def pushes(problem: StepProblem, step: Evaluation, state: State) -> Asking[FloatArray]:
+    """Sums of a step's forces, moments and sizes for `check_momentum`, as of `parallel.together`.
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+        state: The state it leads to.
+    """
+    local, rule, batches = np.zeros(16), problem.integrator, problem.batches
+    old = zip(batches.join(problem.state.u), *batches.rates(problem.state), strict=True)
+    each = zip(batches.bodies, batches.numbers, step.terms, old, batches.join(state.v), strict=True)
+    for body, (k, *_), terms, (u0, v0, a0), v1 in each:
+        force = terms.external - terms.internal - terms.coupling
+        force[body.fixed] += terms.residual[body.fixed]
+        local[:3] += body.linear_momentum(force)
+        local[3:6] += body.angular_momentum(u0 + 0.5 * terms.du, force)
+        parts = (terms.internal, terms.external, terms.coupling)
+        local[6] += sum(float(np.abs(p).sum()) for p in parts)
+        speed = np.abs(v0) + np.abs(v1)
+        if rule.accelerations:
+            # What the velocity would be without the forces of this step.
+            free = problem.supports.coast(k, v0, a0)
+            local[9:12] += body.linear_momentum(body.inertia(free - v0))
+            speed += np.abs(free)
+        local[13:] += problem.supports.bend(k, terms.du)
+        local[7] += float(np.abs(body.nodal_mass) @ speed)
+        local[8] += float(terms.du @ terms.du)
+    for batch, part in zip(problem.elements, step.parts, strict=True):
+        # Of forces that cancel each other within a body only the rounding counts.
+        local[12] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
+    return (yield local, np.empty(0))[0]

@@ -1,7 +1,8 @@
 """Velocities restored after nodes come into contact (theory section 7; Laursen and Love 2002).
 
 A node that comes into contact within a step is stopped at the surface, and the energy of its
-normal motion is lost. An impulse along the forces that stopped it gives the energy back, or the
+normal motion is lost; so is that of a joint that reaches its limit, and of what a cable stops as it
+becomes taut. An impulse along the forces that stopped it gives the energy back, or the
 part of it that a coefficient of restitution e leaves. The energy of bodies that touch or are joined
 is a parabola in the multiple of these impulses. Its minimum is a plastic impact; what lies above it
 is scaled by e^2. The impulses on slave and master are opposite and act at one place, so they
@@ -56,7 +57,7 @@ class Impact(NamedTuple):
 def restored(
     problem: StepProblem, step: Evaluation, state: State, restitution: float
 ) -> Impact | None:
-    """The state after impulses on the nodes and edges that came into contact in a step. Collective.
+    """The state after impulses on what came to touch, or was stopped, in a step. Collective.
 
     Args:
         problem: Equations of the step.
@@ -65,7 +66,7 @@ def restored(
         restitution: e between 0 and 1.
 
     Returns:
-        None where no node came into contact.
+        None where nothing was.
     """
     contacts = _new(problem, step)
     system, comm = problem.system, problem.system.comm
@@ -74,7 +75,7 @@ def restored(
     if not pushes.sum() > 0.0:
         return None
     _refuse_moved(problem, step)
-    bodies_of = [system.pair_bodies[new.contact] for new in contacts]
+    bodies_of = [new.bodies for new in contacts]
     both = zip(bodies_of, pushes, strict=True)
     groups = _groups(problem, [bodies for bodies, push in both if push > 0.0])
     forces = _forces(problem, contacts)
@@ -101,7 +102,8 @@ def restored(
     for new, bodies in zip(contacts, bodies_of, strict=True):
         of = _group(groups, bodies)
         share = float(shares[groups == of].max()) if of >= 0 else 0.0
-        impulses[new.contact] += share * new.impulse
+        if new.contact is not None:
+            impulses[new.contact] += share * new.impulse
     impulses = system.on_slaves(impulses).swapaxes(0, 1).copy()
     comm.Allreduce(MPI.IN_PLACE, impulses, op=MPI.SUM)
     return Impact(replace(state, v=v), energy, impulses)
@@ -122,15 +124,25 @@ def _refuse_moved(problem: StepProblem, step: Evaluation) -> None:
 
 
 def _groups(problem: StepProblem, touched: list[tuple[int, ...]]) -> npt.NDArray[np.int_]:
-    """Bodies that new touches or joints link have one number; -1: nothing moves freely."""
+    """Bodies that new touches, or joints that hold, link have one number; -1: none is free."""
     system = problem.system
+    held = [
+        system.joint_bodies[k]
+        for coupling, numbers in problem.couplings.joints
+        for k in numbers if any(map(_holds, coupling.elements))
+    ]  # fmt: skip
     free = np.array([body.num_owned - body.fixed.size for body in system.bodies])
     groups = np.where(system.comm.allreduce(free) > 0, np.arange(len(free)), -1)
-    for bodies in (*touched, *system.joint_bodies):
+    for bodies in (*touched, *held):
         linked = {int(groups[b]) for b in bodies} - {-1}
         if linked:
             groups[np.isin(groups, list(linked))] = min(linked)
     return groups
+
+
+def _holds(batch: Any) -> bool:
+    """Whether elements pass impulses on: a spring does not, nor a slack cable."""
+    return bool(batch.bilateral and batch.widths["constraints"])
 
 
 def _group(groups: npt.NDArray[np.int_], bodies: Sequence[int]) -> int:
@@ -139,18 +151,20 @@ def _group(groups: npt.NDArray[np.int_], bodies: Sequence[int]) -> int:
 
 
 class _New(NamedTuple):
-    """What nodes or edges of a contact do that came to touch in a step.
+    """The impulses of what came to touch in a step of a contact, or was stopped by a joint.
 
     Attributes:
-        contact: Number of the contact among `System.pairs`.
-        batch: Elements of the contact.
-        push: Impulse of the step along the normals [N s], their sum on this rank.
-        rows: Of the elements' coordinates [N s], shape (elements, coordinates).
+        contact: Number of the contact among `System.pairs`; None: a joint.
+        bodies: Numbers of its bodies.
+        batch: Its elements, which may be those of other joints, too.
+        push: Size of the impulses of the step [N s], their sum on this rank.
+        rows: Impulses on the coordinates of the batch [N s], shape (elements, coordinates).
         impulse: On the slave's body, and its moment about the origin [N m s], shape (2, 3).
         lost: Energy that they have lost on this rank [J].
     """
 
-    contact: int
+    contact: int | None
+    bodies: tuple[int, ...]
     batch: Any
     push: float
     rows: FloatArray
@@ -159,7 +173,10 @@ class _New(NamedTuple):
 
 
 def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
-    """What came to touch in a step, of each contact: nodes, and edges if any are. Collective."""
+    """What came to touch in a step, of each contact and joint, the same on all ranks. Collective.
+
+    Of a contact these are nodes, and edges if any are.
+    """
     found, rate = [], problem.integrator.rate(problem.dt)
     couplings = problem.couplings
     nodes = [
@@ -179,7 +196,19 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
             first = problem.system.contact_bodies[k][0]
             pushed = SimpleNamespace(residual=-rows)
             impulse = batch.resultant(pushed, 0, step.bodies[first].u1)[:2]
-        found.append(_New(k, batch, push.sum(), rows, impulse, lost))
+        bodies = problem.system.pair_bodies[k]
+        found.append(_New(k, bodies, batch, push.sum(), rows, impulse, lost))
+    for coupling, numbers, parts in couplings.of_joints(step):
+        for batch, part in zip(coupling.elements, parts, strict=True):
+            stopped = batch.stopped(part, rate)
+            if stopped is None:
+                continue
+            rows, sizes = stopped.impulses, np.abs(stopped.impulses).sum(axis=1)
+            of = batch.joint if len(numbers) > 1 else np.zeros(len(rows), dtype=int)
+            for j, number in enumerate(numbers):
+                push, lost = (float(each[of == j].sum()) for each in (sizes, stopped.lost))
+                bodies = problem.system.joint_bodies[number]
+                found.append(_New(None, bodies, batch, push, rows, np.zeros((2, 3)), lost))
     return found
 
 
@@ -207,7 +236,7 @@ def _response(
         for batch, part, of in zip(
             problem.elements, step.parts, problem.couplings.bodies, strict=True
         )
-        if batch.bilateral and batch.widths["constraints"]
+        if _holds(batch)
     ]
     if not chosen:
         both = zip(batches.bodies, impulses, strict=True)

@@ -12,6 +12,8 @@ import numpy as np
 
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.ledger.balance import OF_JOINTS, told_by
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
 
@@ -34,20 +36,24 @@ def reactions_of(item: Any) -> str:
 
 
 def is_resultant(column: str) -> bool:
-    """Whether a column is one of these, not of the ledger."""
-    return column in CONTACTS or column.startswith(REACTIONS)
+    """Whether a column is one of these, or of single joints, not of the ledger."""
+    return column in CONTACTS or column.startswith(REACTIONS) or column.endswith(OF_JOINTS)
 
 
 def at_start(system: System) -> dict[str, FloatArray]:
     """Zeros of the right shapes, for the row of the start."""
     row = {reactions_of(b): np.zeros((len(b.reaction_labels), 3)) for b in system.bodies}
-    row |= {reactions_of(joint): np.zeros((2, 3)) for joint in system.declared_joints}
+    joints = system.declared_joints
+    row |= {reactions_of(joint): np.zeros((2, 3)) for joint in joints}
+    row |= {f"{name}{OF_JOINTS}": np.zeros(len(joints)) for name in told_by(system)}
     none = np.zeros((len(system.contacts), 3))
     return row | {CONTACT_FORCES: none, CONTACT_MOMENTS: none}
 
 
-def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
-    """Forces of a step [N], where its integrator takes them, the same on all ranks. Collective.
+def of_step(problem: StepProblem, step: Evaluation) -> Asking[dict[str, FloatArray]]:
+    """Forces of a step [N], where its integrator takes them, the same on all ranks.
+
+    As of `parallel.together`. Collective.
 
     Returns:
         By column:
@@ -78,8 +84,8 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     coupled = {id(batch): part for batch, part in zip(problem.elements, step.parts, strict=True)}
     of_joints = _of_joints(problem, coupled, u)
     parts.append(of_joints.reshape(-1, 3))
-    total = np.concatenate(parts)
-    problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    total, _ = yield np.concatenate(parts), np.empty(0)
+    total = total.reshape(-1, 3)
     stops = accumulate(map(len, parts))
     split = [total[stop - len(part) : stop] for part, stop in zip(parts, stops, strict=True)]
     found = {reactions_of(body): np.zeros((0, 3)) for body in problem.system.bodies}

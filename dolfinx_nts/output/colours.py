@@ -103,7 +103,7 @@ def _pressure(body: Body, run: Any) -> FloatArray:
     force = getattr(run, "mean_force", lambda k: run.state.contacts[k].force)
     for k, pair in enumerate(run.system.contacts):
         if pair.slave.body is body:
-            pressure = pressures(pair.slave, force(k), run.system.slave_areas[k])
+            pressure = pressures(pair.slave, force(k), run.system.slave_area(k, run.state))
             here = contact_fields.spread(pair.slave, np.nan, pressure, pressure)
             total = np.where(np.isnan(here), total, np.nan_to_num(total) + here)
     carrier = fem.Function(body.space)
@@ -168,6 +168,8 @@ def scale_of(values: FloatArray, colour: Colour, limits: Any, units: str) -> Sca
     if colour == "body":
         return Scale((-0.5, _BODIES - 0.5), *_NAMED["body"], (False, False))
     values = values[np.isfinite(values)]
+    if not len(values):
+        return Scale((0.0, 1.0), "viridis", "", (False, False))
     size = float(np.abs(values).max(initial=0.0))
     there = values[np.abs(values) > _NONE * size]
     low, high = np.percentile(there, _ENDS).tolist() if len(there) else (0.0, 0.0)

@@ -166,7 +166,7 @@ class _Series:
         found = contact_fields.at_nodes(system, state, solution.contact_loads, self.body)
         for label, k in self.contacts.items():
             slave, mean = system.contacts[k].slave, stepper.mean_force(k)
-            pressure = pressures(slave, mean, system.slave_areas[k])
+            pressure = pressures(slave, mean, system.slave_area(k, state))
             for name, values in (("force", mean), ("pressure", pressure)):
                 found[f"contact_{name}_mean_{label}"] = contact_fields.spread(
                     slave, 0.0, values, values

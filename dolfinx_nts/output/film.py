@@ -32,13 +32,13 @@ class _Frame(NamedTuple):
     """What is seen at a time, on rank 0.
 
     Attributes:
-        time: [s].
+        title: Its time, or the part of the loads.
         seen: Bodies, obstacles and joints.
         places: Of nodes with contact forces [m], shape (n, 3).
         forces: There [N], shape (n, 3).
     """
 
-    time: float
+    title: str
     seen: Seen
     places: FloatArray
     forces: FloatArray
@@ -123,7 +123,9 @@ class Film:
             gather_on_root(stepper.system.comm, np.concatenate(a))
             for a in zip(*found, strict=True)
         )
-        self._frames.append(_Frame(stepper.state.time, now, places, forces))
+        time = f"{stepper.state.time:.4g}"
+        title = f"t = {time} s" if stepper.solution.moving else f"{time} of the loads"
+        self._frames.append(_Frame(title, now, places, forces))
 
     def _draw(self) -> None:
         """Paint all frames on one canvas size, and write them; rank 0 only."""
@@ -139,7 +141,7 @@ class Film:
         metres = _LONGEST * float((high - low).max()) / largest if largest else 0.0
         images = []
         for k, (frame, forces) in enumerate(zip(self._frames, flat, strict=True)):
-            figure = painter.figure(k, f"t = {frame.time:.4g} s")
+            figure = painter.figure(k, frame.title)
             places = frame.places @ painter.turn[:, :2]
             _arrows(figure.axes[0], places, metres * forces, _LEAST * metres * largest)
             figure.set_dpi(_DOTS)

@@ -17,6 +17,8 @@ from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import known_options
 
 _GREY, _OBSTACLE, _LINE, _MARK = "#b8b8b8", "#ededE6", "#262626", "crimson"
+#: Opacity of obstacles from behind.
+_CLEAR = 0.3
 #: Half the length of an axis, as part of the diagonal of the scene.
 _AXIS = 0.04
 
@@ -43,7 +45,7 @@ def view(
 
     Returns:
         pyvista's Plotter on rank 0, with an actor of the name of each body, and "obstacles",
-        "lines", "points" and "axes"; None on the others.
+        "obstacles from behind", "lines", "points" and "axes"; None on the others.
 
     Raises:
         ModuleNotFoundError: pyvista is not installed.
@@ -53,8 +55,7 @@ def view(
     given = Given.of("scene", scene)
     check_look(given, colour, (0.0, 0.0), limits, 1.0, units)
     now = seen(given, colour)
-    comm = given.bodies[0].comm
-    return on_root(comm, lambda: _plotter(now, colour, limits, units))
+    return on_root(given.comm, lambda: _plotter(now, colour, limits, units))
 
 
 def _plotter(now: Seen, colour: Colour, limits: Any, units: str) -> Any:
@@ -71,8 +72,12 @@ def _plotter(now: Seen, colour: Colour, limits: Any, units: str) -> Any:
         )  # fmt: skip
     ((corners, _),) = obstacle_facets([now])
     if len(corners):
-        # A floor hides nothing from below.
-        plotter.add_mesh(_facets(corners), name="obstacles", color=_OBSTACLE, culling="back")
+        # A floor is seen from below, and so are the bodies through it.
+        walls = _facets(corners)
+        plotter.add_mesh(walls, name="obstacles", color=_OBSTACLE, culling="back")
+        plotter.add_mesh(
+            walls, name="obstacles from behind", color=_OBSTACLE, culling="front", opacity=_CLEAR
+        )
     half = _AXIS * float(np.linalg.norm(np.ptp(now.points, axis=0)))
     place, along = np.moveaxis(now.sketch.axes, 1, 0)
     along = half * along / np.linalg.norm(along, axis=1, keepdims=True)

@@ -17,8 +17,10 @@ from dolfinx_nts.types import FloatArray
 _PATCHES = 100
 #: Direction of the light in (right, up, towards the viewer).
 _LIGHT = np.array([-0.35, 0.55, 0.76])
-#: Colours of facets without a value, of obstacles, edges of facets, lines, points and axes.
-_GREY, _OBSTACLE, _RIM, _LINE, _MARK = "0.72", (0.93, 0.93, 0.9), (0, 0, 0, 0.5), "0.15", "crimson"
+#: Colours of facets without a value, of obstacles from both sides, edges of facets, lines, points
+#: and axes.
+_GREY, _OBSTACLE, _BEHIND = "0.72", (0.93, 0.93, 0.9), (0.86, 0.86, 0.83)
+_RIM, _LINE, _MARK = (0, 0, 0, 0.5), "0.15", "crimson"
 #: Half the length of an axis, as part of the smaller side of a picture; the least part that this
 #: is of the larger one; the least height of what is drawn [inch].
 _AXIS, _THIN, _HEIGHT = 0.07, 0.05, 1.4
@@ -75,7 +77,7 @@ class Painter:
         # A line seen from aside still has a figure, and the text of the colour bar has its height.
         sides = high - low
         least = np.array([_THIN * sides[1], max(_THIN, _HEIGHT / look.width) * sides[0]])
-        thin = np.maximum(least - sides, 0.0)
+        thin = np.maximum(least - sides, 0.0) if sides.any() else np.ones(2)
         self.ends = low - 0.5 * thin, high + 0.5 * thin
 
     def figure(self, k: int, title: str, labels: bool = False) -> Any:
@@ -160,9 +162,7 @@ def _shapes(
     values = np.concatenate([np.empty((0, 4)), *(d.values for d in now.drawn)])
     front = _normals(corners)[:, 2] > 0
     corners, values = corners[front], values[front]
-    # A plane that is seen from behind hides nothing, nor does the near side of a hollow.
-    facing = (obstacles[1] @ turn)[:, 2] > 0
-    walls, normals = obstacles[0][facing] @ turn, obstacles[1][facing] @ turn
+    walls, normals = (a @ turn for a in obstacles)
     both = np.concatenate([corners, walls])
     diagonals = both[:, 2:] - both[:, :2]
     area = 0.5 * np.linalg.norm(np.cross(diagonals[:, 0], diagonals[:, 1]), axis=1)
@@ -171,12 +171,17 @@ def _shapes(
     size = math.sqrt(2 * float(area.sum()) / (_PATCHES * dots)) or float(lengths.max(initial=1.0))
     x, value, rim = _cut(corners, values, size)
     wall, normal, _ = _cut(walls, np.repeat(normals[:, None], 4, axis=1), size)
+    # A plane that is seen from behind hides nothing, nor does the near side of a hollow: they are
+    # painted first.
+    behind = normal[:, 2] <= 0
+    paint = _lit(np.tile(to_rgba(_OBSTACLE), (len(wall), 1)), normal)
+    paint[behind] = to_rgba(_BEHIND)
     rod, _, _ = _cut(_flat(lines[:, 0], lines[:, 1]), np.zeros((len(lines), 4)), size)
     dot = 72.0 / dots
-    each = [
+    each: list[tuple[FloatArray, FloatArray, float, Any]] = [
         # What is drawn, its colours, widths of its lines, and how much nearer it counts: edges
         # else vanish below the patches beside them, and bodies in the floor that they stand on.
-        (wall, _lit(np.tile(to_rgba(_OBSTACLE), (len(wall), 1)), normal), dot, -1.0),
+        (wall, paint, dot, np.where(behind, -np.inf, -1.0)),
         (x, _lit(mappable.to_rgba(value), _normals(x)), dot, 0.0),
         (rim, np.tile(to_rgba(_RIM), (len(rim), 1)), 0.35, 0.5),
         (rod, np.tile(to_rgba(_LINE), (len(rod), 1)), 1.3, 1.0),

@@ -39,8 +39,9 @@ def picture(
     """Draw a scene as it stands; every rank calls it, rank 0 writes.
 
     Obstacles are drawn as far as the bodies reach. Points and axes of joints are drawn over the
-    bodies; a cable is straight between its points, also where it is slack. Bodies without a mesh
-    are left out; of a beam without an outline the axis is drawn.
+    bodies; a cable is straight between its points, also where it is slack. Rigid bodies without a
+    mesh are lines from their centres to their joints; of a beam without an outline the axis is
+    drawn.
 
     Args:
         scene: A `System`, what `simulate` or `equilibrium` return, a `Stepper`, or a sequence of
@@ -76,7 +77,7 @@ def picture(
         figure = painter.figure(0, title, labels)
         save_figure(figure, file, dpi=_DOTS, bbox_inches="tight", pad_inches=0.05)
 
-    write_on_root(given.bodies[0].comm, f"path={str(path)!r}", draw)
+    write_on_root(given.comm, f"path={str(path)!r}", draw)
 
 
 def check_look(

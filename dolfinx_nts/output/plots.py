@@ -18,13 +18,17 @@ Balance = Mapping[str, FloatArray]
 
 
 class _Panel(NamedTuple):
-    """One plot; with `floor`, absolute values on a logarithmic axis, from that value upwards."""
+    """One plot; with `floor`, absolute values on a logarithmic axis, from that value upwards.
+
+    It is `idle` where there is nothing to be plotted, as without contacts or in equilibrium.
+    """
 
     title: str
     unit: str
     lines: dict[str, FloatArray]
     floor: float | None = None
     steps: bool = False
+    idle: bool = False
 
 
 #: Lower end of logarithmic axes relative to what is compared: nothing below means anything.
@@ -34,7 +38,7 @@ _STYLES = ("-", "--", ":", "-.")
 
 
 #: Of a figure; to let matplotlib find them takes as long as to draw it.
-_MARGINS = {"left": 0.08, "right": 0.99, "bottom": 0.07, "top": 0.96, "hspace": 0.22, "wspace": 0.2}
+_MARGINS = {"left": 0.08, "right": 0.99, "hspace": 0.22, "wspace": 0.2}
 
 
 def _panels(balance: Balance, several: bool) -> list[_Panel]:
@@ -48,10 +52,13 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
         energy = _Panel("Energy", "[J]", lines)
     works = (*ledger.WORKS, *ledger.CHANGES)
     scale = float(np.nanmax(np.abs(balance["energy"]), initial=0.0)) or 1.0
+    # Without contacts no gap is ever known.
+    apart = not (balance["active"].any() or np.isfinite(balance["min_gap"]).any())
+    first = "" if apart else "contact_defect"
     work = {
         name.replace("_", " "): balance[name]
         for name in ("contact_defect", *(n for n in works if n != "contact_defect"))
-        if name == "contact_defect" or not np.abs(balance[name]).max() <= _ROUND_OFF * scale
+        if name == first or not np.abs(balance[name]).max() <= _ROUND_OFF * scale
     }
     nodes = {
         n: balance[n] for n in ("active", "stick", "slip") if n == "active" or balance[n].any()
@@ -60,22 +67,24 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
     panels = [
         energy,
         _Panel("Ledger residual / largest energy", "[-]", residual, _ROUND_OFF),
-        _Panel(", ".join(work).capitalize(), "[J]", work),
-        _Panel("Slave nodes in contact", "[-]", nodes, steps=True),
+        _Panel(", ".join(work).capitalize(), "[J]", work, idle=not work),
+        _Panel("Slave nodes in contact", "[-]", nodes, steps=True, idle=apart),
     ]
     for name, unit in (("linear", "kg m/s"), ("angular", "kg m²/s")):
         value = balance[f"{name}_momentum"]
         size = float(np.linalg.norm(value, axis=1).max())
         title = f"Change of {name} momentum (of {size:.3g} {unit})"
         change = {"": np.linalg.norm(value - value[0], axis=1)}
-        panels.append(_Panel(title, f"[{unit}]", change, _ROUND_OFF * (size or 1.0)))
+        floor = _ROUND_OFF * (size or 1.0)
+        panels.append(_Panel(title, f"[{unit}]", change, floor, idle=not size))
     return panels
 
 
 def plot_balance(balance: Balance, path: StrPath | None = None) -> Any:
     """Plot energies, ledger residual, defect and work, active nodes, momentum changes over time.
 
-    Call it on one rank; `Solution.plot` sees to that.
+    A scene without contacts has no active nodes to plot. Call it on one rank; `Solution.plot` sees
+    to that.
 
     Args:
         balance: `Solution.balance`.
@@ -120,17 +129,27 @@ def picture_of(figure: Any, dpi: int = 150, kind: str = "png") -> bytes:
 def _plot(balances: Mapping[str, Balance], path: StrPath | None) -> Any:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.5, 7.5))
-    grid = figure.subplots(3, 2, sharex=True, gridspec_kw=_MARGINS)
     runs = [(run, b["time"], _panels(b, len(balances) > 1)) for run, b in balances.items()]
-    for k, axes in enumerate(grid.T.ravel()):
+    each = zip(*(panels for *_, panels in runs), strict=True)
+    busy = [[panel for panel in alike if not panel.idle] for alike in each]
+    shown = [k for k, panels in enumerate(busy) if panels]
+    rows = (len(shown) + 1) // 2
+    figure = Figure(figsize=(9.5, 2.5 * rows))
+    margins = _MARGINS | {"bottom": 0.21 / rows, "top": 1.0 - 0.12 / rows}
+    grid = figure.subplots(rows, 2, sharex=True, squeeze=False, gridspec_kw=margins)
+    below = [*grid[-1]]
+    if len(shown) % 2:
+        grid[-1, -1].remove()
+        below[-1] = grid[-2, -1]
+    for k, axes in zip(shown, grid.T.ravel(), strict=False):
         for r, (run, time, panels) in enumerate(runs):
             _lines(axes, panels[k], time, run, r if len(runs) > 1 else None)
-        _style(axes, runs[0][2][k])
+        _style(axes, busy[k][0])
         if any(not line.get_label().startswith("_") for line in axes.lines):
             axes.legend(fontsize=8, frameon=False)
-    for axes in grid[-1]:
+    for axes in below:
         axes.set_xlabel("time [s]", fontsize=9)
+        axes.tick_params(labelbottom=True)
     if path is not None:
         save_figure(figure, Path(path), dpi=150)
     return figure
@@ -163,6 +182,8 @@ def _style(axes: Any, panel: _Panel) -> None:
     if panel.floor is not None:
         axes.set_yscale("log")
         axes.minorticks_off()
+        # Whole decades, of which one at least has a number.
+        axes.set_ylim(*10.0 ** (np.log10(axes.get_ylim()) + [-0.5, 0.5]).round())
 
 
 def save_figure(figure: Any, path: Path, **options: Any) -> None:

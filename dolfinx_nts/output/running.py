@@ -28,6 +28,10 @@ class Results(Protocol):
         """How the run goes, or has ended."""
 
     @property
+    def moving(self) -> bool:
+        """Whether it is one in time; else time is the part of the loads."""
+
+    @property
     def warnings(self) -> Any:
         """What was warned of, see `RunWarnings`."""
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.contact.linear_facets import body_facets, node_places
 from dolfinx_nts.contact.obstacles import Obstacle
@@ -46,7 +47,7 @@ class Given(NamedTuple):
 
         Raises:
             TypeError: It is none.
-            ValueError: No body has a mesh.
+            ValueError: There is nothing to be seen of its bodies.
         """
         run = scene if hasattr(scene, "system") and hasattr(scene, "state") else None
         system = scene if run is None else run.system
@@ -55,10 +56,18 @@ class Given(NamedTuple):
         else:
             wanted = "bodies with a mesh, or a System or what simulate(...) returns"
             system, run, bodies = None, None, items(name, scene, _has_mesh, wanted)
-        if not bodies:
-            raise ValueError(f"{name}={scene!r}: pass at least one body with a mesh")
+        if not bodies and not (system and system.declared_joints):
+            raise ValueError(
+                f"{name}={scene!r}: pass at least one body with a mesh; of bodies without one, the "
+                "joints are drawn, of which it has none"
+            )
         time = 0.0 if run is None or run.state is None else run.state.time
         return cls(bodies, system, run, time)
+
+    @property
+    def comm(self) -> Any:
+        """MPI communicator."""
+        return self.system.comm if self.system else self.bodies[0].comm
 
 
 def _has_mesh(body: Any) -> bool:
@@ -119,12 +128,23 @@ def seen(given: Given, colour: Colour) -> Seen:
         drawn.append(Drawn(body.name, *both))
     if given.system is None:
         return Seen(drawn, joined(sketches), [])
-    comm = given.system.comm
+    comm = given.comm
     for joint in given.system.declared_joints:
-        sketches.append(joint.sketch([body.last_accepted()[0] for body in joint.bodies]))
+        sketch = joint.sketch([body.last_accepted()[0] for body in joint.bodies])
+        sketches += [sketch, _sticks(joint, sketch.points)]
     there = {id(m): m for m in (p.master for p in given.system.contacts) if isinstance(m, Obstacle)}
     obstacles = [(m, m.displacement(given.time, comm)) for m in there.values()]
     return Seen(drawn, joined(sketches), obstacles)
+
+
+def _sticks(joint: Any, points: FloatArray) -> Sketch:
+    """Lines from centres of rigid bodies without a mesh to the nearest point of a joint."""
+    bare = [b.position for b in joint.bodies if isinstance(b, RigidBody) and b.mesh is None]
+    if not bare or not len(points):
+        return Sketch(points=np.reshape(bare, (-1, 3)))
+    centres = np.array(bare)
+    apart = np.linalg.norm(centres[:, None] - points, axis=2)
+    return Sketch(np.stack([centres, points[apart.argmin(axis=1)]], axis=1), centres)
 
 
 def _has_facets(body: Any) -> bool:

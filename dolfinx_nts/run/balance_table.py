@@ -9,6 +9,7 @@ import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger import balance, resultants
+from dolfinx_nts.parallel import Asking, together
 from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.record import Table
 from dolfinx_nts.run.solution import Solution
@@ -79,16 +80,16 @@ class Ledger:
         return change
 
     def before(self, state: State) -> BalanceRow:
-        """What `measure` finds at t_n, which the table has but for changes of materials."""
+        """What `measuring` finds at t_n, which the table has but for changes of materials."""
         if not self._kept:
-            return balance.momenta(self._system, state)
+            return together(self._system.comm, [balance.momenta(self._system, state)])[0]
         return self._restated or self._last_row()
 
-    def measure(self, state: State) -> BalanceRow:
-        """Momenta of a state, and energies if they are kept. Collective."""
+    def measuring(self, state: State) -> Asking[BalanceRow]:
+        """Momenta of a state, and energies if they are kept, as of `parallel.together`."""
         if not self._kept:
             return balance.momenta(self._system, state)
-        return balance.measure(self._system, state, self._known)
+        return balance.measuring(self._system, state, self._known)
 
     def _last_row(self) -> BalanceRow:
         """The table's last row, read from the table only if `enter` did not write it."""
@@ -102,8 +103,16 @@ class Ledger:
         step, impact, rows = trial.step, trial.impact, self._solution.rows
         before = self._last_row()
         known = {"time": trial.state.time, "newton_iterations": step.iterations}
+        works: list[Asking[Any]] = [resultants.of_step(problem, step)]
         if self._kept:
-            terms = balance.step_terms(problem, step) | known
+            works += [
+                balance.step_terms(problem, step), self._promises.motions(problem, step),
+                balance.switches(problem, step, trial.state.time),
+            ]  # fmt: skip
+        forces, *of_ledger = together(self._system.comm, works)
+        if self._kept:
+            terms, motions, switches = of_ledger
+            terms |= known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"] = self.take_change()
             if trial.fitted is not None:
@@ -112,7 +121,6 @@ class Ledger:
             row = balance.next_row(first, before, trial.measured, terms)
         else:
             row = balance.unknown_row(self._system) | known
-        forces = resultants.of_step(problem, step)
         if impact is not None:
             for name, impulse in zip(resultants.CONTACTS, impact.impulses, strict=True):
                 forces[name] = forces[name] + impulse / problem.dt
@@ -123,6 +131,5 @@ class Ledger:
         rows.append(row)
         self._last = rows, len(rows), row
         if self._kept:
-            self._promises.hold(problem, step, before, row, trial.impulses)
-            found = balance.switches(problem, step, trial.state.time)
-            self._solution.switches.extend(found)
+            self._promises.hold(problem, step, before, row, trial.impulses, motions)
+            self._solution.switches.extend(switches)

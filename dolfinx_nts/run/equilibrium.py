@@ -28,18 +28,24 @@ from dolfinx_nts.validation import (
 )
 
 
-def _remedy(system: System) -> str:
-    """What to do if a load step is not solved. Collective."""
-    text = "Try more load steps, or inspect the nodes named here"
+def _remedy(system: System) -> tuple[str, str]:
+    """What to do if a load step is not solved, and if a small part is not. Collective."""
+    texts = (
+        "Try more load steps, or inspect the nodes named here",
+        "more load steps hardly help: inspect the nodes named here, or go on in time, with "
+        "simulate(..., start=), if there may be no equilibrium near, as where something snaps "
+        "through",
+    )
     joined = {id(body) for joint in system.joints for body in joint.bodies}
     for body in system.bodies:
         held = anywhere(system.comm, bool(body.fixed.any()))
         if not held and id(body) not in joined:
-            return (
-                f"{text}; {body.name!r}, which nothing but contact holds, must touch at the start, "
-                "or needs stabilization=0.1"
+            held_by = (
+                f"; {body.name!r}, which nothing but contact holds, must touch at the start, or "
+                "needs stabilization=0.1"
             )
-    return text
+            return texts[0] + held_by, texts[1] + held_by
+    return texts
 
 
 def _pseudo_times(load_steps: Any, begin: float) -> list[float]:

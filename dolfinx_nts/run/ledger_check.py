@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mpi4py import MPI
-
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger import balance
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import Asking, global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.solve.accuracy import EXACT
-from dolfinx_nts.types import BalanceRow
+from dolfinx_nts.types import BalanceRow, FloatArray
 
 #: What the ledger may miss of the energy, over the tolerance of Newton's method ...
 _PER_TOLERANCE = 10.0
@@ -67,9 +65,15 @@ class LedgerCheck:
         """Go on from another run's memory."""
         self._largest, self._whole, self._rounding, self._first = memory
 
+    @staticmethod
+    def motions(problem: StepProblem, step: Evaluation) -> Asking[FloatArray]:
+        """Norm of each body's motion in a step [m], (bodies,), as of `parallel.together`."""
+        squares = problem.batches.sums([np.square(terms.du) for terms in step.terms])
+        return np.sqrt((yield squares, np.empty(0))[0])
+
     def hold(
         self, problem: StepProblem, step: Evaluation, before: BalanceRow,
-        row: BalanceRow, impulses: float,
+        row: BalanceRow, impulses: float, motions: FloatArray,
     ) -> None:  # fmt: skip
         """Warn if a step's ledger misses too much, or contact brought energy. Collective.
 
@@ -79,12 +83,10 @@ class LedgerCheck:
             before: BalanceRow of the balance table before it.
             row: BalanceRow of the step.
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
+            motions: As of `motions`.
         """
         energy = self._measure(problem, step, before, row)
-        squares = problem.batches.sums([np.square(terms.du) for terms in step.terms])
-        problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-        moved = np.sqrt(squares)
-        self._rounding += _ROUNDING * float(problem.rounding.forces @ moved) / problem.factor
+        self._rounding += _ROUNDING * float(problem.rounding.forces @ motions) / problem.factor
         # Forces do some work even where nothing moves, as gaps are solved to 8 eps of positions:
         # the 2,450 N at each corner of a box at rest act over 1.7e-15 m.
         self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
@@ -188,12 +190,15 @@ class LedgerCheck:
             # What a coefficient of restitution takes is asked for.
             asked, lost = row["impact_restored"] != 0.0, -total - massless
             if not asked and lost > _LOSS * self._largest + self._rounding:
+                worst = balance.largest_loss(problem, step)
+                most = f", in this step most at {worst!r}" if worst else ""
                 self._solution.warn(
                     "energy lost to contact", row["time"], lost,
                     f"{who} have taken an energy of {lost:.3g}, "
-                    f"{self._part(lost):.2g} of the largest energy: how bodies rebound may "
-                    "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
-                    "and, where bodies are meshes, a finer one",
+                    f"{self._part(lost):.2g} of the largest energy{most}: how bodies rebound may "
+                    "depend on it; compare with a smaller dt (with Adapt a smaller tolerance)"
+                    f"{' and, where bodies are meshes, a finer one' * nodes}, or pass "
+                    "impact='restored' with EnergyMomentum or Midpoint",
                 )  # fmt: skip
             return
         self._solution.warn(kind, row["time"], gain, text, grave=True)

@@ -11,7 +11,7 @@ from dolfinx_nts.integrators import Static
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.ledger.contact_fields import ContactLoads
-from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.parallel import anywhere, global_max, together
 from dolfinx_nts.run import step_warnings
 from dolfinx_nts.run.ledger_check import NOT_FINITE
 from dolfinx_nts.run.solution import Equilibrium
@@ -59,15 +59,17 @@ class _Relaxed:
         system: The scene.
 
     Attributes:
-        of_joints: Columns of the balance table for energy that leaves through joints.
+        of_joints: Columns of the balance table for energy that leaves through joints, and those
+            of each of them.
         lost: By column, what left in all relaxations but the last one [J].
         driven: External work that the ledgers of each joint's elements name in all of them, this
             rank's part [J], shape (joints,).
     """
 
     def __init__(self, system: System) -> None:
-        self.of_joints = {name for joint in system.joints for name in joint.losses}
-        self.lost = dict.fromkeys(self.of_joints, 0.0)
+        own = {name for joint in system.joints for name in joint.losses}
+        self.of_joints = own | {name + balance.OF_JOINTS for name in own if system.declared_joints}
+        self.lost: dict[str, Any] = dict.fromkeys(self.of_joints, 0.0)
         self.driven = np.zeros(len(system.joints))
 
 
@@ -133,10 +135,17 @@ class LoadStepper(Stepper):
         local += self._joints_works(old, state, relaxed.driven)
         local.append(self._interference_work(old, state))
         *works, pressed = self.system.comm.allreduce(np.array(local)).tolist()
-        forces_now, before = resultants.of_step(self.problem, step), self.solution.rows[-1]
-        terms = balance.step_terms(self.problem, step)
+        before, both = self.solution.rows[-1], (resultants.of_step, balance.step_terms)
+        asked: list[Any] = [of(self.problem, step) for of in both]
+        forces_now, terms = together(self.system.comm, asked)
         for name, lost in relaxed.lost.items():
-            terms[name] += lost
+            terms[name] = terms[name] + lost
+        if declared := len(self.system.declared_joints):
+            of_joints = np.array(works[len(self.system.bodies) :])
+            terms |= {
+                f"external_work{balance.OF_JOINTS}": of_joints[:declared],
+                f"contact_defect{balance.OF_JOINTS}": np.zeros(declared),
+            }
         for k, pair in enumerate(self.system.contacts):
             mean = 0.5 * (before["contact_forces"][k] + forces_now["contact_forces"][k])
             start, end = pair.path(old.time, time)
@@ -281,16 +290,17 @@ class LoadStepper(Stepper):
                     lowest = problem.stabilization.share
                     continue
                 iterations += step.iterations
-                relaxed.driven += balance.told_by_joints(problem, step)
+                told = balance.told_by_joints(problem, step)
+                relaxed.driven += told.get("external_work", 0.0)
                 state, dt = reached, 0.0
                 left, restless = unrest(problem, step)
                 if left <= 1.0:
                     allowed = next(strays, np.inf)
                     if problem.couplings.contacts.strayed(step) <= allowed:
                         return step, state, iterations, relaxed
-                terms = balance.step_terms(problem, step)
+                (terms,) = together(self.system.comm, [balance.step_terms(problem, step)])
                 for name in relaxed.of_joints:
-                    relaxed.lost[name] += terms[name]
+                    relaxed.lost[name] = relaxed.lost[name] + terms[name]
                 if left <= 1.0:
                     # On the facets that its nodes have come to, the rest is another one.
                     search, last = True, np.inf

@@ -85,9 +85,10 @@ class LockingWatch:
             elif share > _LOCKED:
                 solution.warn(
                     "locking", time, share,
-                    f"cells of body {body.name!r} may be too stiff for its motion: {share:.2g} of "
-                    f"its squared stress is in jumps from cell to cell, and more than {_LOCKED} "
-                    f"means errors of several per cent; {body.remedy_of_locking}",
+                    f"cells of body {body.name!r} may be too stiff for its motion: the squares "
+                    f"of its stress's jumps from cell to cell are {share:.2g} of those of the "
+                    f"stress; more than {_LOCKED} means errors of several per cent, in stress "
+                    f"and pressure above all; {body.remedy_of_locking}",
                     about=(body.name,),
                 )  # fmt: skip
             elif body.is_thin:

@@ -45,6 +45,7 @@ def paced(stepper: Stepper, pace: Pace, end: float) -> Iterator[None]:
             raise
         except StepFailedError as failure:
             if retries == stepper.newton.max_retries:
+                failure.part = dt / pace.longest
                 raise
             retries += 1
             stepper.solution.retries += 1

@@ -37,10 +37,11 @@ def progress_bar(steps: int | None, wanted: bool) -> Iterator[Any]:
         yield None
         return
     from tqdm import tqdm
+    from tqdm.contrib.logging import logging_redirect_tqdm
 
     logger = dolfinx_compat.logger
     level, propagate = logger.level, logger.propagate
-    with tqdm(total=steps, unit="step") as bar:
+    with logging_redirect_tqdm(), tqdm(total=steps, unit="step") as bar:
         lines = _Lines(bar)
         if not logger.isEnabledFor(logging.INFO):  # else the user's own handler tells it
             logger.addHandler(lines)

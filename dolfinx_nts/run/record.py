@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 
 from dolfinx_nts.ledger import resultants
-from dolfinx_nts.ledger.balance import CHANGES, COLUMNS, Switch, Switches
+from dolfinx_nts.ledger.balance import CHANGES, COLUMNS, OF_JOINTS, Switch, Switches
 from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
 from dolfinx_nts.types import Array, FloatArray
 
@@ -162,17 +162,35 @@ class Record:
         bodies, shape (rows, 2, 3). They are NaN where elements of one's own do not say them, see
         `Elements.resultant`.
 
-        In dynamics that of each step, with inertia, where the integrator takes its forces. A
-        coordinate that two conditions prescribe counts with the later one.
+        In dynamics that of each step, with inertia, where the integrator takes its forces; the row
+        of the start is zero. A coordinate that two conditions prescribe counts with the later one.
         """
         start, columns = resultants.REACTIONS, self.rows.columns.items()
         return {name.removeprefix(start): c for name, c in columns if name.startswith(start)}
 
     @property
+    def joint_works(self) -> dict[str, dict[str, FloatArray]]:
+        """Parts of columns of the balance by joints, by the column's name and the joint's.
+
+            run.joint_works["friction_dissipation"]["hinge friction"][-1]
+
+        Energy since the start [J], shape (rows,): "friction_dissipation", "contact_defect" of
+        limits and cables, "external_work" of motors and prescribed motion, and what dampers take.
+        """
+        columns, end = self.rows.columns, OF_JOINTS
+        parts = {
+            name.removesuffix(end): c for name, c in columns.items() if name.endswith(end)
+        }
+        count = next((c.shape[1] for c in parts.values()), 0)
+        joints = list(self.reactions)[len(self.reactions) - count :]
+        return {name: dict(zip(joints, c.T, strict=True)) for name, c in parts.items()}
+
+    @property
     def contact_forces(self) -> FloatArray:
         """Resultant of each contact on its slave body [N], shape (rows, contacts, 3).
 
-        In dynamics that of each step; with a consistent mass the forces of single steps alternate.
+        In dynamics that of each step; with a consistent mass the forces of single steps alternate,
+        see `mean_of_two_steps`.
         """
         return self.rows.column(resultants.CONTACT_FORCES)
 
@@ -185,6 +203,33 @@ class Record:
         """
         return self.rows.column(resultants.CONTACT_MOMENTS)
 
+    def mean_of_two_steps(self, values: FloatArray) -> FloatArray:
+        """Means of each step and the one before it over their time.
+
+        Forces that hold something at rest, such as reactions, those of limits and of contacts,
+        alternate about these from step to step.
+
+            run.mean_of_two_steps(run.reactions["hinge"])[-1]
+
+        Args:
+            values: Of each row of the balance table, such as `reactions` of one joint or
+                `contact_forces`, shape (rows, ...).
+
+        Returns:
+            The same shape. The row of the start and that of the first step are as given.
+
+        Raises:
+            ValueError: There are not as many values as rows.
+        """
+        given = np.asarray(values, dtype=float)
+        if len(given) != len(self.rows):
+            raise ValueError(f"values of {len(given)} rows: pass one for each of {len(self.rows)}")
+        means, steps = given.copy(), np.diff(self.rows.column("time"))
+        impulses = given[1:] * steps.reshape(-1, *(1,) * (given.ndim - 1))
+        over = (steps[1:] + steps[:-1]).reshape(-1, *(1,) * (given.ndim - 1))
+        means[2:] = (impulses[1:] + impulses[:-1]) / over
+        return means
+
     @property
     def summary(self) -> str:
         """How the run went in a few lines: steps, energy, changes of facet; equal on all ranks."""
@@ -193,8 +238,13 @@ class Record:
         first, last = self.rows[0], self.rows[-1]
         steps = len(self.rows) - 1
         iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
+        # What a run that is complete says in its status stands in the lines of its warnings.
+        doubtful = self.status.startswith("completed, but")
+        status = "completed, but see the warnings" if doubtful else self.status
+        # Why it has ended is a sentence by itself.
+        then = ": " if status.startswith(("running", "completed")) else "\n"
         lines = [
-            f"{self.status}: {steps} steps to t = {last['time']:.6g}, {self.retries} retries, "
+            f"{status}{then}{steps} steps to t = {last['time']:.6g}, {self.retries} retries, "
             f"{self.rejected} rejected, {iterations:.2f} Newton iterations per step",
         ]
         if np.isnan(last["energy"]):

@@ -34,6 +34,8 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
+#: A step that fails where it is cut to less than this part would hardly pass in shorter ones.
+_CUT_FAR = 0.01
 #: Order of the integrators whose error `Adapt` knows.
 _ADAPTED = 2
 
@@ -142,8 +144,9 @@ def simulate(
             after the start, and nothing watches over energy and momentum. It costs a few parts in a
             hundred of small scenes' steps.
         impact: "published": nodes that come into contact lose the energy of their normal motion,
-            see contact_defect in the balance. "restored": impulses along their contact forces give
-            it back at the end of the step, see impact_restored; momenta and gaps stay as they are.
+            see contact_defect in the balance, and so do joints that reach a limit and cables that
+            become taut. "restored": impulses along the forces that stopped them give it back at the
+            end of the step, see impact_restored; momenta and gaps stay as they are.
             High frequencies are excited, and contacts open and close more often. For
             `EnergyMomentum()` and `Midpoint()` in equal steps, without prescribed motion. The
             impulses have no tangential part, also where there is friction. They are in
@@ -203,7 +206,11 @@ def simulate(
             f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]; pass a later one, or "
             "begin after an equilibrium with start_time=0.0"
         )
-    remedy = "Try a smaller dt"
+    remedy = (
+        "Try a smaller dt",
+        "a smaller dt hardly helps: look at what is named here for nodes that two contacts or a "
+        "support hold, cells too coarse for it, and loads or speeds that crush them",
+    )
     end, dt = float(t_end), float(dt)
     stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
     if adapt is not None:
@@ -251,7 +258,7 @@ def run(
     output: Sequence[Writer],
     *,
     progress: bool,
-    remedy: str,
+    remedy: tuple[str, str],
     adapt: Adapt | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Solution:
@@ -262,7 +269,8 @@ def run(
         steps: Length and end of each [s], one after another; with `adapt` the largest and the end.
         output: Writers.
         progress: Show a progress line on rank 0.
-        remedy: What to do if a step fails and says nothing better, for `status`.
+        remedy: What to do if a step fails and says nothing better, for `status`, and what if it
+            fails as well where it is cut to a small part.
         adapt: How to choose the steps between, each of which is written.
         checkpoint: Where and how often to write what `restart` needs.
     """
@@ -275,7 +283,7 @@ def _run(
     steps: Sequence[tuple[float, float]],
     output: Sequence[Writer],
     progress: bool,
-    remedy: str,
+    remedy: tuple[str, str],
     adapt: Adapt | None,
     checkpoint: Checkpoint | None,
 ) -> Solution:
@@ -307,10 +315,17 @@ def _run(
         except StepFailedError as failure:
             _last_look(stepper)
             jump = stepper.jumps_at_start(steps[0][0])
+            text = solution.worded(str(failure))
             if jump:
-                _stop(stepper, f"{failure}; {jump}")
-            else:
-                _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
+                text += f"; {jump}"
+            elif not failure.advises:
+                whole, cut = remedy
+                far = failure.part < _CUT_FAR
+                short = f"Steps of {failure.part:.2g} of the length asked for fail, too, so that "
+                text += f". {short}{cut}" if far else f". {whole}"
+            # The status has all of it, which scripts print.
+            headline = text.partition("; ")[0].partition(": ")[0].partition(" (")[0]
+            _stop(stepper, text, told=f"{headline}: the run's status says where and what to do")
         except BaseException:
             # Where one rank alone comes here, no other answers.
             _call(stepper, started, "close")
@@ -392,11 +407,13 @@ def _interrupted(stepper: Stepper, signal: str, checkpoint: Checkpoint | None) -
     return text + f"; go on with start=restart({str(checkpoint.path)!r}, system)"
 
 
-def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> None:
-    """Keep in the status why a run ended, and log it where it is known best."""
+def _stop(
+    stepper: Stepper, reason: str, cause: BaseException | None = None, *, told: str = ""
+) -> None:
+    """Keep in the status why a run ended, and log it, or what is told, where it is known best."""
     _end(stepper.solution, reason)
     if stepper.system.comm.rank == 0 or cause is not None:
-        logger.warning("%s", reason, exc_info=cause)
+        logger.warning("%s", told or reason, exc_info=cause)
 
 
 def _end(solution: Solution, reason: str) -> None:

@@ -79,8 +79,12 @@ class Solution(Record):
         about: tuple[str, ...] = (),
     ) -> None:
         """Add a warning; every rank must make the same call, see `RunWarnings.add`."""
-        root = self.system.comm.rank == 0
+        root, text = self.system.comm.rank == 0, self.worded(text)
         self.warnings.add(kind, time, size, text, grave=grave, about=about, speak=root)
+
+    def worded(self, text: str) -> str:
+        """A sentence of a step as this kind of run says it."""
+        return text
 
     def finish(self) -> None:
         """Say in the status that the run is complete, and what may be wrong in it."""
@@ -146,6 +150,10 @@ class Equilibrium(Solution):
     rates: tuple[FloatArray, ...] = ()
     forces: tuple[FloatArray, ...] = ()
     moving: ClassVar[bool] = False
+
+    def worded(self, text: str) -> str:
+        """What contacts and joints say knows of no load steps, which are what can be smaller."""
+        return text.replace("a smaller dt", "more load steps")
 
     @property
     def _fields(self) -> dict[str, tuple[FloatArray, ...]]:

@@ -115,13 +115,14 @@ class Pace:
 
     Attributes:
         dt: Size of the next step [s] unless a gap closes or the run ends before.
+        longest: Largest size [s].
         shortest: Smallest size [s] but for cut steps and the last ones.
         exceeds: Whether the last step was accepted though its error is above the tolerance.
     """
 
     def __init__(self, adapt: Adapt, system: System, state: State, dt: float, span: float) -> None:
         self._tolerance, self._span = adapt.tolerance, span
-        self._longest, self.shortest = dt, adapt.shortest * dt
+        self.longest, self.shortest = dt, adapt.shortest * dt
         self.dt = self.shortest
         self._top, self._size = _norms(system, state.v)[0], _size(system)
         self._before: tuple[float, tuple[FloatArray, ...]] | None = None
@@ -135,7 +136,7 @@ class Pace:
 
     def resume(self, memory: PaceMemory) -> None:
         """Go on from another run's memory."""
-        self.dt = min(max(memory.dt, self.shortest), self._longest)
+        self.dt = min(max(memory.dt, self.shortest), self.longest)
         self._top, self._error = memory.top, memory.error
         if memory.before is not None:
             self._before = memory.before, memory.accelerations
@@ -197,7 +198,7 @@ class Pace:
         # After an error that was small by chance the next would be cut again.
         change = factor(max(error, self._error))
         if h >= self.dt * (1 - 1e-9) and change > 1.0:
-            self.dt = min(h * change, self._longest)
+            self.dt = min(h * change, self.longest)
         self._top = max(self._top, speed)
         self._before, self._error = (h, acceleration), error
         if self._meets:

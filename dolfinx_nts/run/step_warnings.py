@@ -12,11 +12,12 @@ from dolfinx_nts.bodies.solid.inversion import describe, smallest_dets
 from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION
+from dolfinx_nts.contact.straight_faces import turn_of_straight_faces
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import FAR_TURN
-from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.start import incomplete
 from dolfinx_nts.solve.instability import releasing_motions
@@ -181,6 +182,22 @@ def tell_pieces(solution: Solution, time: float) -> None:
         )  # fmt: skip
 
 
+def tell_straight(solution: Solution, time: float) -> None:
+    """Warn of contact surfaces of degree 2 whose faces are straight and seem to be of a curve."""
+    surfaces = (s for pair in solution.system.contacts for s in pair.surfaces)
+    for surface in {id(s): s for s in surfaces}.values():
+        angle, name = np.degrees(turn_of_straight_faces(surface)), surface.body.name
+        if angle:
+            solution.warn(
+                "straight faces", time, angle,
+                f"a contact surface of {name!r} has straight faces that turn by {angle:.2g} "
+                "degrees from one to the next: if the part is curved, forces and pressures are "
+                "those of a polygon; gmsh.model.mesh.setOrder(2) lets cells follow the curve, and "
+                "a finer mesh comes nearer to it",
+                about=(name,),
+            )  # fmt: skip
+
+
 def tell_units(solution: Solution, time: float, *, in_time: bool) -> None:
     """Warn of bodies whose numbers no one system of units explains. Collective."""
     for name, size, text in doubtful_units(solution.system, in_time=in_time):
@@ -215,7 +232,8 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
     awake: set[int] = set()
     if measured:
         # What has no mass has no spin.
-        masses = system.comm.allreduce(np.array([b.nodal_mass.sum() for b in system.bodies]))
+        own = np.array([b.nodal_mass.sum() for b in system.bodies])
+        masses = global_sum(system.comm, own)
         awake = set(problem.awake) & set(np.flatnonzero(masses > 0.0).tolist())
     oriented = [body.oriented for body in system.bodies]
     if not (any(oriented) or awake):

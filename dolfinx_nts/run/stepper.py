@@ -13,8 +13,9 @@ from dolfinx_nts.bodies.conditions import jumps
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger.contact_fields import ContactLoads
-from dolfinx_nts.ledger.guards import check_momentum
+from dolfinx_nts.ledger.guards import check_momentum, pushes
 from dolfinx_nts.ledger.impact import restored
+from dolfinx_nts.parallel import together
 from dolfinx_nts.petsc_compat import close_at_exit
 from dolfinx_nts.run import step_warnings
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
@@ -170,6 +171,7 @@ class Stepper:
         if self.restart is None:
             self._ledger.open(state, start)
             step_warnings.tell_pieces(self.solution, state.time)
+            step_warnings.tell_straight(self.solution, state.time)
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -260,6 +262,7 @@ class Stepper:
         self.system.check_alive()
         self.start(dt)
         end, parts = self.state.time + dt if end is None else end, Parts(self.newton.max_retries)
+        asked = dt
         while parts.left:
             try:
                 self._step(dt, end - (parts.left - 1) * dt)
@@ -267,6 +270,7 @@ class Stepper:
                 raise
             except StepFailedError as failure:
                 if not parts.cut():
+                    failure.part = dt / asked
                     raise
                 self.solution.retries += 1
                 dt = (end - self.state.time) / parts.left
@@ -397,15 +401,17 @@ class Stepper:
         problem, ledger, impact = self.problem, self._ledger, None
         step = solved(problem, self.solver)
         state = state_after(problem, step, time)
-        before, measured = ledger.before(self.state), ledger.measure(state)
-        impulses = check_momentum(problem, step, state, before, measured)
+        before = ledger.before(self.state)
+        works: list[Any] = [ledger.measuring(state), pushes(problem, step, state)]
+        measured, pushed = together(self.system.comm, works)
+        impulses = check_momentum(problem, pushed, before, measured)
         if self._restitution is not None:
             impact = restored(problem, step, state, self._restitution)
         state = state if impact is None else impact.state
         drives = consistent.fitted(problem, state)
         state = state if drives is None else drives.state
         if impact or drives:
-            measured = ledger.measure(state)
+            (measured,) = together(self.system.comm, [ledger.measuring(state)])
         return Trial(step, state, measured, impulses, impact, drives)
 
     def take(self, trial: Trial) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import repeat
 
 import numpy as np
 from petsc4py import PETSc
@@ -12,10 +13,13 @@ from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.types import FloatArray
 
-#: Iterations in which nodes touch or stick otherwise than before until their laws are blurred.
-_CLEAR = 2
-#: The first width, over the largest of the lengths by which nodes press, have slid or lie behind.
+#: Iterations in which nodes touch or stick otherwise than before until their laws are blurred: in a
+#: heap most steps settle by the fifth, and to blur and sharpen takes eight more.
+_CLEAR = 6
+#: The first width, over the largest of the lengths by which nodes that do not settle press, have
+#: slid or lie behind.
 _FIRST = 0.1
 #: A blurred law counts as solved where rows miss less than this part of widths and bounds; ...
 _NEAR = 0.8
@@ -26,30 +30,47 @@ _PATIENCE, _WIDER = 4, 10.0
 #: Width over the first one from which on gaps are no more blurred: equations that repeat others
 #: have the compliance of the blurred law alone, which is that of the square of the width.
 _PARTED = 1e-3
+#: The slip over the last width from which on nodes slide that blurred laws have brought to their
+#: bounds. Those that stick slip by less than the width, or by half of what they did an iteration
+#: before.
+_APART = 1e4
 
 
 class BlurredContacts:
     """Blurs contact and friction that do not settle by themselves, and sharpens them again.
 
     Where rigid bodies lie on several others, more nodes touch than are needed, and each one that
-    leaves, sticks or slips pulls at the others: the laws alone let them change back and forth. With
+    leaves, sticks or slips pulls at the others: the laws alone let them change back and forth. In
+    statics nodes with friction do so, too, where a round body begins to touch along a line. With
     forces that are smooth functions of gap and slip the equations are regular, also those that
     repeat each other, and one iteration a width suffices mostly, from anywhere (smoothing Newton
     methods: Chen and Harker 1993; Kanzow 1996). Slips that no motion of rigid bodies closes, as of
     a face that has come down on its edge, are second order in its turn and may be tiny: friction is
     sharpened up to slips that count as none. The laws have the last word, so that no solution
     changes but how forces divide that are not unique: as the blurred laws have divided them.
+
+    Blurred friction of a node that slides by little misses its bound by half the square of width
+    over slip, which is more than the return map adds for that slip. So nodes would stick that
+    cannot all stick, and the iterates go through the same circle. With its scale steep, slips tell
+    which nodes slide. One whose slip turns back may stick again.
+
+    Attributes:
+        blurs: Whether the laws are blurred.
     """
 
     def __init__(self, problem: StepProblem) -> None:
         self._problem = problem
+        self._steep: list[FloatArray] = []
         self.try_again()
 
     def try_again(self) -> None:
         """Obey the laws no longer than need be, as an attempt at a step begins."""
-        self._changes, self._tries, self._blurs = 0, 0, False
+        self._changes, self._tries, self.blurs = 0, 0, False
         self._width, self._sharp, self._last = 0.0, 0.0, 0.0
         self._problem.shared_weight.kept = False
+        if self._steep:
+            self._problem.couplings.steepen(repeat(0.0))
+            self._steep = []
 
     def at(self, last: Evaluation, new: Evaluation, x: PETSc.Vec) -> tuple[Evaluation, bool]:
         """The new iterate by the laws or by what leads to it, and whether it is led. Collective.
@@ -61,12 +82,17 @@ class BlurredContacts:
         """
         comm, count = self._problem.system.comm, self._problem.couplings.num_touching
         batches, parts = self._problem.elements[:count], new.parts[:count]
-        if not self._blurs:
-            both = zip(last.parts[:count], parts, strict=True)
-            if not anywhere(comm, any((a.status != b.status).any() for a, b in both)):
+        if not self.blurs:
+            both = list(zip(last.parts[:count], parts, strict=True))
+            turned = new.turned
+            if self._steep:
+                new = self._turned(new, both, x)
+                both = list(zip(last.parts[:count], new.parts[:count], strict=True))
+                turned = anywhere(comm, any((a.status != b.status).any() for a, b in both))
+            if not turned:
                 return new, False
             self._changes += 1
-            if self._changes <= _CLEAR or not self._begins(batches, parts):
+            if self._changes <= _CLEAR or not self._begins(batches, both):
                 return new, False
             return self._blurred(x), True
         found = self._blurred(x)
@@ -80,36 +106,64 @@ class BlurredContacts:
             return self._blurred(x), True
         self._tries = 0
         if self._width <= self._last:
-            self._blurs, self._changes = False, 0
-            return new, False
+            self.blurs, self._changes = False, -_CLEAR
+            self._steep = [
+                batch.law.coefficient * -part.end[:, 0].clip(max=0.0) / (_APART * self._width)
+                for batch, part in zip(batches, found.parts[:count], strict=True)
+            ]
+            return self._steepened(x), False
         self._width *= _SHARPER
         return self._blurred(x), True
 
     def _begins(
-        self, batches: Sequence[ContactElements], parts: Sequence[Contribution]
+        self,
+        batches: Sequence[ContactElements],
+        both: Sequence[tuple[Contribution, Contribution]],
     ) -> bool:
-        """Choose the widths; whether there is anything to blur. Collective."""
+        """Choose the widths; whether there is anything to blur. Collective.
+
+        What a blow elsewhere presses by says nothing of those that change.
+        """
         largest, least = 0.0, np.inf
-        for batch, part in zip(batches, parts, strict=True):
+        for batch, (last, part) in zip(batches, both, strict=True):
+            changes = (last.status != part.status).any(axis=0)
             press = -part.multiplier[:, 0] / batch.law.yielding
             for length in (press, part.distance, -part.gap):
-                largest = max(largest, float(length.max(initial=0.0)))
+                largest = max(largest, float(length[changes].max(initial=0.0)))
             least = min(least, float(batch.law.still.min(initial=np.inf)))
-        both = global_max(self._problem.system.comm, np.array([largest, -least]))
-        self._width, self._last = _FIRST * float(both[0]), -float(both[1])
-        self._blurs, self._tries = 0.0 < self._width < np.inf, 0
+        sizes = global_max(self._problem.system.comm, np.array([largest, -least]))
+        self._width, self._last = _FIRST * float(sizes[0]), -float(sizes[1])
+        self.blurs, self._tries = 0.0 < self._width < np.inf, 0
         self._sharp = _PARTED * self._width
-        self._problem.shared_weight.kept |= self._blurs
-        return self._blurs
+        self._problem.shared_weight.kept |= self.blurs
+        return self.blurs
 
     def _blurred(self, x: PETSc.Vec) -> Evaluation:
         """An iterate under blurred laws. Collective."""
         couplings = self._problem.couplings
         couplings.blur(self._width, self._width if self._width > self._sharp else 0.0)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return self._problem.evaluate(x)
+        finally:
+            couplings.blur(0.0, 0.0)
+
+    def _steepened(self, x: PETSc.Vec) -> Evaluation:
+        """An iterate by the laws, of which slips tell what sticks. Collective."""
+        self._problem.couplings.steepen(self._steep)
         with np.errstate(over="ignore", invalid="ignore"):
-            found = self._problem.evaluate(x)
-        couplings.blur(0.0, 0.0)
-        return found
+            return self._problem.evaluate(x)
+
+    def _turned(
+        self, new: Evaluation, both: Sequence[tuple[Contribution, Contribution]], x: PETSc.Vec
+    ) -> Evaluation:
+        """The new iterate where nodes whose slips turn back may stick. Collective."""
+        back = [np.einsum("ni,ni->n", a.slip, b.slip) < 0.0 for a, b in both]
+        again = [(one & (scale > 0.0)).any() for one, scale in zip(back, self._steep, strict=True)]
+        if not anywhere(self._problem.system.comm, any(again)):
+            return new
+        self._steep = [np.where(a, 0.0, b) for a, b in zip(back, self._steep, strict=True)]
+        return self._steepened(x)
 
     def _missed(
         self, batches: Sequence[ContactElements], parts: Sequence[Contribution]

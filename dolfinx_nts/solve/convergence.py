@@ -8,7 +8,7 @@ import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import global_max, global_sum
+from dolfinx_nts.parallel import global_sum, sums_and_largest
 from dolfinx_nts.types import FloatArray
 
 #: Rounding of a sum of elements' forces over the norm of all of them: their own rounding and that
@@ -16,13 +16,12 @@ from dolfinx_nts.types import FloatArray
 _CANCELLED = 32 * float(np.finfo(float).eps)
 
 
-def worst(problem: StepProblem, e: Evaluation) -> float:
-    """The largest of `ratios`. Collective."""
-    of_bodies, of_elements = _of_bodies(problem, e), _of_elements(problem, e)
-    found = np.array([of_bodies.max(), *(max(one.values()) for one in of_elements if one)])
-    if of_elements:
-        found = global_max(problem.system.comm, found.max(keepdims=True))
-    return float(found[0])
+def worst(problem: StepProblem, e: Evaluation, *flags: bool) -> tuple[float, list[bool]]:
+    """The largest of `ratios`, and which of some flags any rank has. Collective, in one call."""
+    own = [max(one.values()) for one in _of_elements(problem, e) if one]
+    sizes = np.array([np.max(own, initial=0.0), *flags])
+    of_bodies, (largest, *found) = _found(problem, e, sizes)
+    return float(np.max([of_bodies.max(), largest])), [flag > 0.0 for flag in found]
 
 
 def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
@@ -31,12 +30,13 @@ def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     Collective.
     """
     names = [body.name for body in problem.system.bodies]
-    ratio = dict(zip(names, _of_bodies(problem, e).tolist(), strict=True))
+    ratio = dict.fromkeys(names, 0.0)
     for found in _of_elements(problem, e):
         # Several contacts of two bodies have one name.
         for name, value in found.items():
             ratio[name] = max(value, ratio.get(name, 0.0))
-    largest = global_max(problem.system.comm, np.array(list(ratio.values())))
+    of_bodies, largest = _found(problem, e, np.array(list(ratio.values())))
+    largest[: len(names)] = np.maximum(largest[: len(names)], of_bodies)
     return dict(zip(ratio, largest.tolist(), strict=True))
 
 
@@ -47,7 +47,9 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
     """
     both = zip(problem.batches.bodies, e.terms, strict=True)
     held = [problem.stabilization.of(body) * terms.du for body, terms in both]
-    found = _over_limits(problem, e, held, problem.rounding.at(problem.lengths.displacement_of(e)))
+    squares = global_sum(problem.batches.comm, _squares(problem, e, held))
+    rounding = problem.rounding.at(problem.lengths.displacement_of(e))
+    found = _over_limits(problem, squares, rounding)
     k = int(np.argmax(found))
     return float(found[k]), problem.system.bodies[k].name
 
@@ -71,28 +73,45 @@ def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
     return abs(work[:, 0].sum()) > share * np.abs(work[:, 1:5]).max() + rounding
 
 
-def _of_bodies(problem: StepProblem, e: Evaluation) -> FloatArray:
-    """`ratios` of the bodies, shape (bodies,). Collective."""
-    residuals = [terms.residual for terms in e.terms]
-    return _over_limits(problem, e, residuals, problem.rounding.forces)
+def _found(
+    problem: StepProblem, e: Evaluation, sizes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`ratios` of the bodies, shape (bodies,), and the largest of some sizes over all ranks (n,).
 
-
-def _over_limits(
-    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
-) -> FloatArray:
-    """A force on each batch over that which counts as zero, by body; asleep 0. Collective.
-
-    It is measured by the largest of its inertial, internal, external and coupling forces. Of
-    elements' forces that cancel each other, as on a body without mass of note between two springs,
-    only the rounding counts, so that strong joints loosen no tolerance.
+    Collective.
     """
+    squares = _squares(problem, e, [terms.residual for terms in e.terms])
+    total, top = sums_and_largest(problem.system.comm, squares.ravel(), sizes)
+    return _over_limits(problem, total.reshape(squares.shape), problem.rounding.forces), top
+
+
+def _squares(
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray]
+) -> FloatArray:
+    """Squares of a force on each body and of those it is measured by, this rank's part, (6, n)."""
     batches, parts = problem.batches, _forces_on(problem, e, forces)
     squares = np.empty((6, batches.count))
     squares[:5] = batches.sums([np.square(own) for own in parts])
     squares[5] = problem.laid.gross_forces(problem.elements, e.parts, batches.count)
-    norms = np.sqrt(global_sum(batches.comm, squares))
+    return squares
+
+
+def _over_limits(
+    problem: StepProblem, squares: FloatArray, rounding: FloatArray
+) -> FloatArray:
+    """A force on each body over that which counts as zero; asleep 0.
+
+    It is measured by the largest of its inertial, internal, external and coupling forces. Of
+    elements' forces that cancel each other, as on a body without mass of note between two springs,
+    only the rounding counts, so that strong joints loosen no tolerance.
+
+    Args:
+        problem: Equations of the step.
+        squares: `_squares` of all ranks.
+        rounding: Of forces on each body, shape (bodies,).
+    """
+    norms, found = np.sqrt(squares), np.zeros(problem.batches.count)
     limits = problem.rtol * norms[1:5].max(axis=0) + _CANCELLED * norms[5] + rounding
-    found = np.zeros(batches.count)
     with np.errstate(divide="ignore", over="ignore"):
         np.divide(norms[0], limits, out=found, where=problem.is_awake & (norms[0] != 0.0))
     return np.where(np.isnan(found), np.inf, found)
@@ -112,28 +131,22 @@ def _forces_on(
 
 
 def _of_elements(problem: StepProblem, e: Evaluation) -> list[dict[str, float]]:
-    """`ratios` of each batch of elements on this rank, for their own unknowns. Collective."""
+    """`ratios` of each batch of elements on this rank, for their own unknowns."""
     if not problem.laid.own:
         return []
-    moved = max(float(np.abs(terms.du).max(initial=0.0)) for terms in e.terms)
-    comm, linked, elements = problem.system.comm, problem.couplings.linked, problem.elements
-    # MPI's maximum may swallow a NaN, so it travels as a flag.
-    local = [moved, float(any(np.isnan(part.residual.sum()) for part in e.parts))]
-    for c, part in zip(elements, e.parts, strict=True):
-        local += c.largest(part)
-    extents = np.zeros(problem.couplings.mechanisms)
-    for c, of in zip(elements, linked, strict=True):
+    motion = max(e.moved, float(problem.lengths.motion.max()))
+    rounded, found = motion + problem.lengths.rounded, []
+    each = zip(problem.elements, e.parts, problem.couplings.linked, strict=True)
+    for k, (c, part, of) in enumerate(each):
+        given = c.largest(part)
+        if len(e.measures):
+            given[2:] = e.measures[k].tolist()
         if of is not None:
-            np.maximum.at(extents, of, c.extents if np.ndim(of) else c.extent)
-    top = global_max(comm, np.array([*local, *extents]))
-    motion = max(top[0], float(problem.lengths.motion.max()))
-    rounded = motion + problem.lengths.rounded
-    extents = top[len(local) :]
-    sizes, found = top[2 : len(local)].reshape(-1, 4), []
-    for c, part, largest, of in zip(elements, e.parts, sizes, linked, strict=True):
-        # What rounding leaves open in a joint the linear solve passes on to all that its bodies
-        # link.
-        given = largest if of is None else [*largest[:3], extents[of]]
+            # What rounding leaves open in a joint the linear solve passes on to all that its
+            # bodies link.
+            given[3] = problem.extents[of]
         ratio = c.ratios(part, given, motion, rounded, problem.rtol)
-        found.append(ratio if not top[1] else dict.fromkeys(ratio, np.inf))
+        if np.isnan(part.residual.sum()):
+            ratio = dict.fromkeys(ratio, np.inf)
+        found.append(ratio)
     return found

@@ -150,10 +150,10 @@ def _body_note(body: Body, terms: BodyTerms) -> tuple[str, float, str]:
 def _held_twice(problem: StepProblem, e: Evaluation) -> list[str]:
     """Which contacts push nodes that others push, too, or none that could move. Collective."""
     names, pushed, stuck = [], [], []
-    # A rigid body's directors are pushed by all that touches it.
-    nodal = [not body.oriented for body in problem.system.bodies]
+    # A rigid body's directors are pushed by all that touches it, and so are those of batches.
+    nodal = {k for k, body in enumerate(problem.system.bodies) if not body.oriented}
     for c, bodies, part in zip(problem.elements, problem.couplings.bodies, e.parts, strict=True):
-        if c.bilateral or not c.widths["constraints"] or not all(nodal[k] for k in bodies):
+        if c.bilateral or not c.widths["constraints"] or not nodal.issuperset(bodies):
             continue
         force = np.abs(part.residual[:, : c.num_coordinates]) > 0.0
         free = np.concatenate(c.dofs(), axis=1) >= 0

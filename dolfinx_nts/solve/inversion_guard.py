@@ -25,6 +25,7 @@ class InversionGuard:
         self._known: dict[int, tuple[FloatArray, float]] = {}
         self._deform = not all(body.rigid for body in problem.system.bodies)
         self._careful, self._shortened = False, 0
+        self._unshortened = np.empty(0)
 
     def begin(self, *, careful: bool) -> None:
         """Begin an attempt.
@@ -50,6 +51,12 @@ class InversionGuard:
         """Whether no body with these smallest det F is inside out that must not be."""
         return not self._deform or bool((forbidden(self._problem.system, dets) > 0.0).all())
 
+    def is_sound(self, x: FloatArray) -> bool:
+        """Whether no cell is inside out or nearly so at an iterate. Collective."""
+        bodies = self._problem.system.bodies
+        low = np.array([body.low_dets[1] for body in bodies])
+        return bool((forbidden(self._problem.system, self.smallest(x)) > low).all())
+
     def shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Scale an update y that SNES subtracts from x; tells whether it did. Collective."""
         if not self._careful:
@@ -66,11 +73,12 @@ class InversionGuard:
             self._shortened = 0
             return False
         self._shortened += 1
+        self._unshortened = start - update
         y.scale(part)
         return True
 
     def describe_inverted(self, x: FloatArray) -> tuple[int, str]:
-        """The body that is inside out at an iterate, and its cell with a remedy. Collective."""
+        """The body whose cell is inside out or nearly so, the cell and a remedy. Collective."""
         system = self._problem.system
         worst = int(forbidden(system, self.smallest(x)).argmin())
         body = system.bodies[worst]
@@ -78,6 +86,13 @@ class InversionGuard:
         if body.oriented:
             return worst, text
         return worst, f"{text}, {type(body).__name__}(..., allow_inversion=True) accepts it"
+
+    def describe_shortened(self) -> str:
+        """Why it gives up, and what the last update would have done in full. Collective."""
+        x = self._unshortened
+        worst = int(forbidden(self._problem.system, self.smallest(x)).argmin())
+        text, _ = describe(self._problem.system.bodies[worst], self._displacements(x)[worst])
+        return f"{_SHORTENED} updates in a row were shortened; in full, {text}"
 
     def describe_flat(self, x: FloatArray) -> tuple[int, str, bool] | None:
         """The cell that is nearly inside out at t_n or an iterate, if one is. Collective.

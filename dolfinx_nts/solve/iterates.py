@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from dolfinx_nts.contact.contact_law import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
+from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.solve.blurred_contacts import BlurredContacts
 from dolfinx_nts.solve.rubbing_joints import RubbingJoints
 from dolfinx_nts.types import IntArray
@@ -18,7 +18,7 @@ _PATIENCE = 4
 #: Changes of an element's status from which on it goes to and fro.
 _TO_AND_FRO = 4
 #: Iterations at most in which nodes hardly rub.
-_SLIDING = 8
+_SLIDING = 12
 #: Nodes that slip run away if they do so by more than this part of a facet and by so many times
 #: what they have slid where they hardly rubbed.
 _FAR, _FARTHER = 0.25, 2.0
@@ -29,9 +29,12 @@ class Iterates:
 
     Attributes:
         last: Evaluation of the last iterate.
+        known: PETSc vectors that hold it on all ranks, and their states: PETSc counts changes of a
+            vector, and the same ones on all ranks.
         flips: Of each batch of elements how often each has changed its status.
         led: How many iterates of the attempt blurred laws have led, see `RubbingJoints` and
             `BlurredContacts`.
+        settled: Whether no element of this rank changed its status in the last iteration.
         imposed: Whether the last iterate was evaluated with contacts that its laws would change.
         runs_away: Whether nodes that hardly rub slid so far that friction must be what holds them.
     """
@@ -44,9 +47,9 @@ class Iterates:
 
     def restart(self) -> None:
         """Forget all iterates, as a step begins."""
-        self.last: Evaluation | None = None
+        self._forget()
         self.flips: list[IntArray] = []
-        self.imposed, self._settled, self._pivots = False, True, False
+        self.imposed, self.settled, self._pivots = False, True, False
         self._fewest, self._patience = np.inf, _PATIENCE
         self.runs_away, self._slid_by = False, 0.0
         self.led = 0
@@ -59,7 +62,8 @@ class Iterates:
 
         See `Rub`. What friction alone holds runs away.
         """
-        self.last, self._sliding, self._slid_by = None, _SLIDING, 0.0
+        self._forget()
+        self._sliding, self._slid_by = _SLIDING, 0.0
         self._problem.couplings.contacts.rub(Rub.HARDLY)
 
     def try_again(self, *, pivots: bool) -> None:
@@ -72,7 +76,8 @@ class Iterates:
                 is the state that cycles, see `LentStiffness`.
         """
         self._rub_by_law()
-        self.last, self.imposed = None, False
+        self._forget()
+        self.imposed = False
         self.runs_away, self._slid_by = False, 0.0
         self._pivots = pivots and self._problem.integrator.inertia
         self._fewest, self._patience = np.inf, _PATIENCE
@@ -80,16 +85,22 @@ class Iterates:
         self._joints.try_again()
         self._contacts.try_again()
 
+    def _forget(self) -> None:
+        self.last: Evaluation | None = None
+        self.known: list[tuple[PETSc.Vec, int]] = []
+
     def at(self, x: PETSc.Vec) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one. Collective."""
-        last = self.last
-        same = last is not None and np.array_equal(last.x, x.array_r)
-        if everywhere(self._problem.system.comm, same):
-            assert last is not None
+        last, state = self.last, x.stateGet()
+        if last is not None and (x, state) in self.known:
             return last
         # A diverging iterate may overflow; the convergence test sees it.
         with np.errstate(over="ignore", invalid="ignore"):
-            new = self._problem.evaluate(x)
+            new = self._problem.evaluate(x, last)
+        if new is last:
+            self.known.append((x, state))
+            return new
+        self.known = [(x, state)]
         self.imposed = False
         if last is not None and self._pivots:
             new = self._pivoted(last, new, x)
@@ -107,15 +118,16 @@ class Iterates:
             new, led = self._joints.at(last, new, x)
             self.led += led
             self.imposed |= led
-        self._settled = not self.imposed
-        if last is None:
+        self.settled = not self.imposed
+        if last is None or self._sliding:
+            # Which nodes touch is sought first; whether they stick is not known yet.
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
         else:
             for k, (a, b) in enumerate(zip(last.parts, new.parts, strict=True)):
                 if self.flips[k].size:
                     changes = a.status != b.status
                     self.flips[k] += changes
-                    self._settled &= not changes.any()
+                    self.settled &= not changes.any()
         self.last = new
         return new
 
@@ -189,21 +201,17 @@ class Iterates:
 
     @property
     def _may_blur(self) -> bool:
-        """Whether contacts may be blurred: of rigid bodies more nodes touch than are needed.
+        """Whether contacts may be blurred. Collective.
 
-        In statics it is the state that cycles.
+        Of rigid bodies more nodes touch than are needed. In statics the state may cycle by itself,
+        so that only nodes with friction are blurred that go to and fro.
         """
-        problem = self._problem
-        return (
-            problem.integrator.inertia
-            and problem.shared_weight.any_rigid
-            and problem.couplings.num_touching > 0
-        )
-
-    @property
-    def settled(self) -> bool:
-        """Whether no element changed its status in the last iteration. Collective."""
-        return everywhere(self._problem.system.comm, self._settled)
+        problem, contacts = self._problem, self._problem.couplings.contacts
+        if not problem.couplings.num_touching:
+            return False
+        if problem.integrator.inertia:
+            return problem.shared_weight.any_rigid
+        return contacts.may_slip and (self._contacts.blurs or self.cycles)
 
     @property
     def cycles(self) -> bool:

@@ -7,7 +7,6 @@ from typing import Any
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import anywhere
 
 #: Relative difference of the factors of two equal steps of a caller whose lengths are rounded.
 _EQUAL = 1e-6
@@ -53,8 +52,9 @@ class KeptTangents:
             for j in range(len(problem.batches.several)):
                 self._matrices.pop(j, None)
             self._version = problem.version
+        # PETSc counts the same on all ranks, as it relies on that itself.
         changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
-        fresh = anywhere(problem.system.comm, self.due or changed)
+        fresh = self.due or changed
         if fresh:
             self._matrices = dict(zip(awake, problem.tangents.at(e), strict=True))
             self.due = not self._reuse()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dolfinx_nts.contact.contact_law import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere
@@ -53,10 +54,15 @@ class LentStiffness:
         return problem.tangents.lent != before
 
     def _slips(self, e: Evaluation) -> bool:
-        """Whether nodes slip with friction, whose forces have no potential. Collective."""
+        """Whether nodes slip with friction, whose forces have no potential. Collective.
+
+        What hardly rubs is held by springs, which have one.
+        """
         contacts = self._problem.couplings.touching(e)
         slip = any(
-            c.law.num_tangential and bool((part.active & ~c.law.sticks(part)).any())
+            c.law.num_tangential
+            and c.law.rubs is not Rub.HARDLY
+            and bool((part.active & ~c.law.sticks(part)).any())
             for _, c, part, _ in contacts
         )
         return anywhere(self._problem.system.comm, slip)

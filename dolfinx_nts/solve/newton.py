@@ -15,7 +15,6 @@ from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.solve.accuracy import EXACT, Newton
 from dolfinx_nts.solve.convergence import leaves_work, worst
 from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
@@ -121,16 +120,19 @@ class StepSolver:
         """Solve the step with the candidates that have unknowns."""
         self.prepare()
         iterations, unsolved = 0, False
-        couplings, moves = self.problem.couplings, self.problem.integrator.inertia
-        may_slip = couplings.contacts.may_slip
+        contacts, moves = self.problem.couplings.contacts, self.problem.integrator.inertia
+        may_slip = contacts.may_slip
+        starts = not moves and bool(contacts.elements) and not contacts.carried_any()
         # Inertia passes on the forces that sticking nodes keep from each other in statics.
-        first = 0 if moves or not may_slip or couplings.contacts.carried_any() else -1
+        first = -1 if may_slip and starts else 0
         for retry in range(first, 2):
             if first < 0 == retry and not self.iterates.runs_away:
                 continue
             slides = may_slip and retry == (-1 if first < 0 else 1)
             self._patient = moves or not may_slip or retry != 0 or first < 0
-            self._begin(retry, slides=slides, again=retry > first, unsolved=unsolved)
+            # Where nothing carries yet, too many nodes touch at first and press cells flat.
+            careful = retry != first + 1 if starts else retry > 0
+            self._begin(retry, careful, slides=slides, again=retry > first, unsolved=unsolved)
             try:
                 self._raised = None
                 self._presets.options.check(self.snes, *self._jacobian.operators)
@@ -171,16 +173,19 @@ class StepSolver:
             self.destroy()
         raise failure
 
-    def _begin(self, retry: int, *, slides: bool, again: bool, unsolved: bool) -> None:
+    def _begin(
+        self, retry: int, careful: bool, *, slides: bool, again: bool, unsolved: bool
+    ) -> None:
         """Begin an attempt at the step; every rank must call it.
 
         Args:
             retry: Number of the attempt; -1 comes before 0 where statics with friction begin.
+            careful: Whether updates are shortened that would turn cells inside out.
             slides: Whether nodes slide in it before they rub.
             again: Whether there was another one before.
             unsolved: Whether the linear solver failed in that.
         """
-        self._upright.begin(careful=retry > 0 or self.problem.dives)
+        self._upright.begin(careful=careful or self.problem.dives)
         if again:
             self._tangents.due, self._passed = True, None
             if retry == 0:
@@ -272,19 +277,29 @@ class StepSolver:
         return self._upright.shorten(x, y)
 
     def _worst(self, e: Evaluation) -> float:
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = worst(self.problem, e)
-        # What contacts satisfy that are held as they are not is no solution.
-        return max(found, 2.0) if e is self.iterates.last and self.iterates.imposed else found
+        return self._look(e)[0]
 
-    def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
-        last = self.iterates.last
+    def _look(self, e: Evaluation, *flags: bool) -> tuple[float, list[bool]]:
+        """What `worst` finds. Collective."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found, flagged = worst(self.problem, e, *flags)
+        # What contacts satisfy that are held as they are not is no solution.
+        imposed = e is self.iterates.last and self.iterates.imposed
+        return max(found, 2.0) if imposed else found, flagged
+
+    def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
+        last, x = self.iterates.last, snes.getSolution()
         assert last is not None
-        reasons = PETSc.SNES.ConvergedReason
-        worst = self._worst(last)
+        reasons, elsewhere = PETSc.SNES.ConvergedReason, not np.array_equal(x.array_r, last.x)
+        acts = any(bool(part.status.any()) for part in last.parts)
+        found = self._look(last, not self.iterates.settled, elsewhere, acts)
+        worst, (changed, elsewhere, acts) = found
+        unchanged = not changed
+        if not elsewhere:
+            # Here SNES asks for the Jacobian next.
+            self.iterates.known.append((x, x.stateGet()))
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
-        unchanged = self.iterates.settled
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
         if stalls and not self._measured:
             # An active set that still changes stalls by itself, not by rounding.
@@ -304,7 +319,7 @@ class StepSolver:
         if worst <= 1.0:
             enough = self._passed is not None or iteration >= allowed
             self._passed = last
-            if enough or worst <= _SURE or not self._adds_up(last):
+            if enough or worst <= _SURE or not self._adds_up(last, acts):
                 return reasons.CONVERGED_FNORM_RELATIVE
         elif self._passed is not None:
             # One more iteration left rounding only: what it started from is the solution.
@@ -323,15 +338,18 @@ class StepSolver:
     def _is_inside_out(self, e: Evaluation) -> bool:
         return not self._upright.accepts(self._upright.smallest(e.x))
 
-    def _adds_up(self, e: Evaluation) -> bool:
+    def _adds_up(self, e: Evaluation, acts: bool) -> bool:
         """Whether what an iteration leaves adds up over steps; every rank must call it.
 
         Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
         where contact acts, the parts differ, and only what is much in one step counts.
+
+        Args:
+            e: Iterate that may be the solution.
+            acts: Whether any contact acts in it.
         """
         problem, rtol = self.problem, self.newton.rtol
-        acts = any(bool(part.status.any()) for part in e.parts)
-        if self._presets.keeps and (rtol <= EXACT or not anywhere(problem.system.comm, acts)):
+        if self._presets.keeps and (rtol <= EXACT or not acts):
             return True
         # Where nothing has inertia there is no ledger.
         return problem.integrator.inertia and leaves_work(problem, e, _EITHER_SIGN * rtol)
@@ -340,7 +358,8 @@ class StepSolver:
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
         """What failed, and where a body is inside out or nearly so; every rank must call it."""
         problem, slides = self.problem, used_up(self.problem, e)
-        if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
+        refused = reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN
+        if refused and not self._upright.is_sound(e.x):
             worst, text = self._upright.describe_inverted(e.x)
             text = contact_on(problem, e, self.iterates.flips, worst) + text
             return StepFailedError(
@@ -349,6 +368,11 @@ class StepSolver:
                 advises=True,
             )
         why, advises = self._presets.why_failed(self.snes, reason)
+        if refused:
+            # Its cells are sound: what ended the attempt is what its updates were about to do.
+            why = "nodes slide away that friction does not hold"
+            if self._upright.gives_up:
+                why = self._upright.describe_shortened()
         message = slides + diagnosis(problem, e, self.iterates.flips, why, iterations)
         advises |= bool(slides) or UNSETTLED in message
         return self.with_flat(message, e, advises=advises)

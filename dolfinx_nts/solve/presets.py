@@ -95,7 +95,7 @@ class Presets:
             chains = all(map(_is_chain, system.bodies)) and not system.contacts
             auto = newton.linear_solver == "auto" and not given
             # Statics may leave a motion free, which MUMPS stands better.
-            if chains and auto and inertia and system.comm.size == 1 and _HAS_KLU:
+            if chains and auto and inertia and _HAS_KLU:
                 self._names = ("chains", *mumps)
         elif newton.linear_solver == "auto":
             self._names += mumps

@@ -1,4 +1,4 @@
-"""Bodies whose stiffness, density and gravity cannot be numbers of one system of units."""
+"""Numbers that are not of one system of units, of bodies under gravity and of limits of angles."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.solid.mass import stiffness_along
+from dolfinx_nts.joints.laws import Limits
+from dolfinx_nts.kernels.measures import Angle
 from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.system import System
 
@@ -27,11 +29,15 @@ _EARTH, _LIKE = 9.81, 0.03
 _SLOWEST, _FASTEST = 0.2, 2.5e4
 #: Weight over E times the section above which a body is no body any more.
 _CRUSHED = 10.0
+#: A turn [rad], and by which part of it a number may differ from a whole one that was meant.
+_TURN, _WHOLE = 2.0 * np.pi, 1e-12
 _REMEDY = "check that modulus, density, lengths and gravity are in one system of units"
 
 
 def doubtful_units(system: System, *, in_time: bool) -> Iterator[tuple[str, float, str]]:
-    """Bodies that gravity would crush, or of a wave speed that no material has. Collective.
+    """Bodies that gravity would crush, or of a wave speed that no material has; limits in degrees.
+
+    Limits of an angle are taken for such if they are whole numbers beyond a turn. Collective.
 
     The first is a ratio without units. The second needs the units of length and time, which
     gravity tells if it is that of the Earth; without gravity nothing is known.
@@ -41,7 +47,7 @@ def doubtful_units(system: System, *, in_time: bool) -> Iterator[tuple[str, floa
         in_time: Whether mass counts: in statics next to no density means no weight.
 
     Yields:
-        Name of a body, by which factor it is out of range, and a sentence with a remedy.
+        Name of a body or joint, by which factor it is out of range, and a sentence with a remedy.
     """
     gravity = float(np.linalg.norm(system.gravity))
     unit, meant = next(
@@ -76,6 +82,22 @@ def doubtful_units(system: System, *, in_time: bool) -> Iterator[tuple[str, floa
                 f"the weight of body {body.name!r} over its section is {_CRUSHED * crushed:.2g} "
                 f"times its modulus, which no support bears: {_REMEDY}"
             )
+    for joint in system.joints:
+        limits = _angles(joint)
+        most = max((abs(end) for end in limits if np.isfinite(end)), default=0.0)
+        if most > _TURN and np.allclose(limits, np.round(limits), rtol=_WHOLE, atol=0.0):
+            yield joint.name, most / _TURN, (
+                f"{joint.name!r}: {limits[0]:.5g} and {limits[1]:.5g} rad are up to "
+                f"{most / _TURN:.2g} turns; pass np.radians of angles in degrees"
+            )
+
+
+def _angles(joint: Any) -> tuple[float, ...]:
+    """Limits of an angle [rad], if a joint is of such."""
+    law: Any = getattr(joint, "law", None)
+    if not isinstance(law, Limits) or joint.measure.kind is not Angle:
+        return ()
+    return law.low / joint.of.length, law.high / joint.of.length
 
 
 def _wave_speed(body: Any) -> float:

@@ -153,6 +153,8 @@ class DamperWatch:
             return None
         if self._rates is None:
             self._rates = self._begin()
+        if not self._rates:
+            return None
         ways, sizes = self._motions(state)
         for k, rates in self._rates.items():
             rates[:] = [*rates[-2:], ways[k]]

@@ -18,6 +18,7 @@ from dolfinx_nts.contact.edges import SHARES
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.pair import Candidates
+from dolfinx_nts.interaction.elements import evaluate_together
 from dolfinx_nts.kernels import compiled, facets
 
 
@@ -72,7 +73,7 @@ def test_force_of_edges_does_the_work_of_the_gap_and_keeps_the_momenta(friction)
     y1[:, :2, 2] -= 0.2
     own = {"augmented": np.empty((1, 0)), "constraints": np.zeros((1, 3 if friction else 1))}
     own["constraints"][:, 0] = -0.7
-    part = edges.evaluate(y1, own)
+    (part,) = evaluate_together(MPI.COMM_SELF, [edges], [y1], [own])
     assert part.active.all()
     force = part.residual[0, :12].reshape(4, 3)
     work = part.multiplier[0, 0] * (part.gap - edges.candidates.gap)[0]
@@ -93,7 +94,8 @@ def test_tangent_of_edges_is_the_derivative_of_their_rows(tangential, rule):
 
     def part(values):
         own = {"augmented": np.empty((1, 0)), "constraints": values[None, 12:]}
-        return edges.evaluate(values[:12].reshape(1, 4, 3), own)
+        x = values[:12].reshape(1, 4, 3)
+        return evaluate_together(MPI.COMM_SELF, [edges], [x], [own])[0]
 
     found, step = part(at), 1e-4
     assert found.active.all() and found.stick.all() == (tangential < 0.1)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.apart import Apart
+from dolfinx_nts.contact.facet_gap import FacetGap
 
 COMM = MPI.COMM_WORLD
 G, SIZE = 9.81, 0.1
@@ -68,6 +69,82 @@ def test_a_vertex_beside_an_edge_stays_out():
         deepest.append(bricks.depth())
     assert stepper.solution.balance["active"].max() > 0
     assert max(deepest) < 1e-9 * SIZE
+
+
+@pytest.mark.fast_on_ranks()
+def test_a_vertex_that_points_at_a_face_stays_out():
+    """Its two edges meet those of the face within the step; it is ahead of them."""
+    bricks = Bricks(
+        ((0.075948135, 0.299752822, 0.140125715), (1.585402058, -0.731010314, -0.537002455),
+         0.091502795, {"velocity": (-0.1455, 0.9339, -0.0843),
+                       "angular_velocity": (-4.691, 12.404, 1.725)}),
+        ((0.102013936, 0.303403814, 0.241606234), (1.213444092, 1.00503448, 1.160452776),
+         0.099320597, {"velocity": (0.5858, 0.3755, -0.7855),
+                       "angular_velocity": (20.377, -0.667, -0.59)}),
+    )  # fmt: skip
+    stepper = nts.Stepper(bricks.system(gravity=(0, 0, -G)), nts.EnergyMomentum())
+    deepest = []
+    for _ in range(3):
+        stepper.advance(2e-3)
+        deepest.append(bricks.depth())
+    assert stepper.solution.balance["active"].max() > 0
+    assert max(deepest) < 1e-9 * SIZE
+
+
+def test_a_corner_over_which_a_cube_tips_stays_out_of_its_face():
+    """Flush faces overlap at a corner of each, and their edges cross beside both.
+
+    One cube turns about the line between the crossings. These are no support of the other's corner,
+    which is beyond that line.
+    """
+    bricks = Bricks(
+        ((0.120619751656, 0.265989002951, 0.347438925363),
+         (0.545841170319, 1.113178424976, -0.671342715452), 0.090666900088, {
+            "velocity": (0.7916, -0.6899, -0.6322), "angular_velocity": (6.3285, 6.3936, 0.8272)}),
+        ((0.088864014775, 0.316290845085, 0.424881727338),
+         (-0.459497731604, 0.300719460691, 2.970883871136), 0.093650461578, {
+            "velocity": (-0.1063, 0.0651, -0.5963), "angular_velocity": (-3.6282, 9.7504, 2.138)}),
+    )  # fmt: skip
+    stepper = nts.Stepper(bricks.system(gravity=(0, 0, -G)), nts.EnergyMomentum())
+    for _ in range(3):
+        stepper.advance(2e-3)
+        assert bricks.depth() < 1e-9 * SIZE
+    assert stepper.solution.balance["active"].max() > 0
+
+
+def test_a_vertex_that_rises_under_a_face_on_the_floor_stays_out():
+    """The floor holds the nodes of the face, and not what comes from below."""
+    turn = np.arccos(1.0 / 3.0**0.5) * np.array([1, -1, 0]) / 2.0**0.5
+    bricks = Bricks(
+        ((0.01, 0.02, -(1.0 + 1e-8) * SIZE * 0.75**0.5), turn, SIZE, {"velocity": (0, 0, 0.5)}),
+        ((0, 0, 0.5 * SIZE), np.zeros(3), SIZE, {"velocity": (0, 0, -0.1)}),
+    )
+    upper, lower = (body.surface(everywhere) for body in bricks.bodies[::-1])
+    contacts = [nts.ContactPair(upper, nts.Plane((0, 0, 0), (0, 0, 1))),
+                nts.ContactPair(upper, lower)]  # fmt: skip
+    stepper = nts.Stepper(nts.System(bricks.bodies, contacts=contacts), nts.EnergyMomentum())
+    for _ in range(3):
+        stepper.advance(2e-3)
+        assert bricks.depth() < 1e-9 * SIZE
+    assert stepper.solution.balance["active"].max() > 0
+
+
+def test_a_facet_that_has_turned_over_holds_nothing():
+    """A flat trapezoid whose sides would meet at y = 3 faces the other way beyond.
+
+    What is in front of its plane there, four lengths from the facet, is no node behind it.
+    """
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0.5, 1, 0], [-0.5, 1, 0]])
+    points = np.array([[[0.2, 5.0, 0.1], *corners], [[0.2, 0.5, 0.1], *corners]])
+    xi, normal = np.zeros((2, 2)), np.tile([0.0, 0, 1], (2, 1))
+    gap = FacetGap(
+        start=points, xi=xi, normal=normal, length=np.full(2, 2.0), rule="direct", theta=0.5,
+        condense=True,
+    )  # fmt: skip
+    assert np.abs(gap.gap(points) - 0.1).max() < 1e-14
+    found = gap.evaluate(points, np.empty((2, 0)), -np.ones((2, 1)))
+    assert np.abs(found.gap - 0.1).max() < 1e-14
+    assert found.let_go.tolist() == [True, False]
 
 
 @pytest.mark.fast_on_ranks()

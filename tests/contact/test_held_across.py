@@ -11,6 +11,7 @@ from scenes import RUBBER
 import dolfinx_nts as nts
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.interaction.elements import evaluate_together
 
 COMM = MPI.COMM_WORLD
 #: Twist, skew and smoothing of `held_across`.
@@ -130,9 +131,8 @@ def at_rest(shape):
 
 
 def evaluate(contact, x, multiplier):
-    return contact.evaluate(
-        x, {"augmented": np.empty((contact.num_elements, 0)), "constraints": multiplier}
-    )
+    own = {"augmented": np.empty((contact.num_elements, 0)), "constraints": multiplier}
+    return evaluate_together(COMM, [contact], [x], [own])[0]
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 import dolfinx_nts as nts
 from dolfinx_nts.contact.pair import Motion
 from dolfinx_nts.contact.skins import locate_facets
+from dolfinx_nts.parallel import together
 
 COMM = MPI.COMM_WORLD
 GRAVITY, MU, STEP = 9.81, 0.2, 0.01
@@ -165,10 +166,9 @@ def test_rounding_does_not_choose_the_facet_at_an_edge(off):
     def facet(start, way, current):
         positions = pair.positions([np.array(start) - mass.reference, 0.0 * master.body.reference])
         paths = [np.array([way, 0.0, 0.0]), 0.0 * master.body.reference]
-        found = pair.find(
-            positions, np.array([current]), np.zeros((2, 3)), Motion(0.1, paths, np.array([-1]))
-        )
-        return found.candidates.facet.tolist()
+        motion = Motion(0.1, paths, np.array([-1]))
+        work = pair.find(positions, np.array([current]), np.zeros((2, 3)), motion)
+        return together(COMM, [work])[0].candidates.facet.tolist()
 
     (left,), (right,) = (facet((x, 0.1, 0.0), 0.0, -1) for x in (0.2, 0.3))
     assert left != right

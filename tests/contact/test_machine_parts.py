@@ -178,11 +178,11 @@ def test_a_seal_that_friction_alone_keeps_from_rolling(friction):
     np.testing.assert_allclose(tetrahedra, planes, atol=1e-6 * abs(planes[1][2]))
 
 
-@pytest.mark.slow
-def test_an_o_ring_between_plates_carries_what_lindley_says():
-    """An eighth of it; F/(pi D d) = E (1.25 c^1.5 + 50 c^6), here of plane strain and nu = 0.49.
+def o_ring(friction, load_steps, **options):
+    """An eighth of an O-ring of nu = 0.49 between plates: the run, and what Lindley says.
 
-    Its authors give that within some per cent. Nothing but contact holds the ring along its axis.
+    F/(pi D d) = E (1.25 c^1.5 + 50 c^6), here of plane strain. Nothing but contact holds it along
+    its axis.
     """
     d, across, young, nu, squeeze = 2.62, 22.62, 5.0, 0.49, 0.5
     part = of_gmsh(
@@ -197,12 +197,42 @@ def test_an_o_ring_between_plates_carries_what_lindley_says():
     )
     skin = body.surface(everywhere)
     top = nts.Plane((0, 0, d), (0, 0, -1), motion=lambda t: (0, 0, -squeeze * t))
-    pairs = [nts.ContactPair(skin, nts.Plane((0, 0, 0), (0, 0, 1))), nts.ContactPair(skin, top)]
-    run = nts.equilibrium(nts.System([body], contacts=pairs), load_steps=4, stabilization=0.1)
-    c = squeeze * run.balance["time"][2:] / d
+    floor = nts.Plane((0, 0, 0), (0, 0, 1))
+    pairs = [nts.ContactPair(skin, plate, friction=friction) for plate in (floor, top)]
+    run = nts.equilibrium(nts.System([body], contacts=pairs), load_steps=load_steps, **options)
+    c = squeeze * run.balance["time"] / d
     lindley = d * young * (1.25 * c**1.5 + 50.0 * c**6) * 0.75 / (1.0 - nu**2)
-    force = -np.asarray(run.contact_forces)[2:, 1, 2] / (np.pi * across / 8.0)
-    np.testing.assert_allclose(force, lindley, rtol=0.06)
+    return run, lindley * (np.pi * across / 8.0)
+
+
+@pytest.mark.slow
+def test_an_o_ring_between_plates_carries_what_lindley_says():
+    """Its authors give that within some per cent."""
+    run, lindley = o_ring(0.0, 4, stabilization=0.1)
+    np.testing.assert_allclose(-run.contact_forces[2:, 1, 2], lindley[2:], rtol=0.06)
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_an_o_ring_with_friction_starts_by_itself():
+    """Contact begins on a line: nodes went to and fro between stick, slip and none.
+
+    Lindley's ring widens freely. Friction holds its radius, up to plane strain, which has
+    1/(1 - nu^2) of that force. Both step sizes lead to the same.
+    """
+    friction, forces = 0.2, []
+    for load_steps in (3, 6):
+        run, lindley = o_ring(friction, load_steps)
+        assert run.status == "completed"
+        both = run.contact_forces[-1]
+        assert both.sum(axis=0)[2] == pytest.approx(0.0, abs=1e-8 * lindley[-1])
+        forces.append(-both[1, 2])
+        for contact in run.state.contacts:
+            pull = np.linalg.norm(contact.tangential, axis=1)
+            assert (pull <= friction * contact.force * (1.0 + 1e-8) + 1e-9 * lindley[-1]).all()
+        assert (np.diff(run.balance["friction_dissipation"]) >= -1e-9 * lindley[-1]).all()
+    assert forces[0] == pytest.approx(forces[1], rel=0.01)
+    assert 1.0 < forces[1] / lindley[-1] < 1.06 / (1.0 - 0.49**2)
 
 
 # ---- a chain

@@ -77,12 +77,11 @@ def test_tension_in_equilibrium(n, mu, shape):
     """Nothing presses at the start: how much each node may rub is known once the rope is taut."""
     system = rope_on_drum(n, mu, shape, (0, 0, -PULL))
     run = nts.equilibrium(system, load_steps=4)
-    assert run.status == "completed"
+    # Without `stabilization`: what is not solved in 25 iterations is cut.
+    assert run.status == "completed" and run.retries == 0
     held = np.linalg.norm(run.reactions["rope"][1:, 0], axis=1)
     load = PULL * run.balance["time"][1:]
     np.testing.assert_allclose(held, tension(n, mu) * load, rtol=5e-3)
-    # Without `stabilization`; of 25 that a load step may take.
-    assert run.balance["newton_iterations"].max() < 20
 
 
 @pytest.mark.slow

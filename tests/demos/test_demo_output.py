@@ -7,6 +7,7 @@ import pytest
 
 SMALL = {
     "bar_impact": {"elements": 4, "t_end": 0.1},
+    "crane": {"dt": 2e-2, "t_end": 0.1},
     "domino": {"dominoes": 3, "duration": 0.02},
     "drum_stick": {"cells": 4, "t_end": 5e-4},
     "flying_beam": {"steps": (0.5,), "t_end": 2.0, "integrators": ("energy-momentum",)},
@@ -14,6 +15,7 @@ SMALL = {
     "flying_l_block": {"t_end": 2.0},
     "heavy_top": {"steps": (4e-3,), "t_end": 0.02, "size": 0.05},
     "leaf_spring": {"cells": 8, "steps": 5, "t_end": 1e-3},
+    "mechanisms": {"cases": ("bricard",), "t_end": 0.2},
     "newtons_cradle": {
         "kinds": ("rigid, touching",), "parts": (0.5,), "cells": 2, "duration": 2e-3,
     },
@@ -21,6 +23,7 @@ SMALL = {
     "own_problem": {"cells": 2, "steps": 4},
     "hertz": {"problems": ("cylinders",), "scales": (0.01,), "refinement": 0.5},
     "ironing": {"block": (16, 2), "die": (4, 2), "steps": (10, 50), "end": 0.2},
+    "robot_arm": {"cases": ("holds",), "t_end": 0.04},
     "rolling": {"facets": 16, "duration": 0.016, "integrators": ("energy-momentum",)},
     "rotating_cross": {"steps": (0.05,), "t_end": 0.2},
     "slider_crank": {"rods": ("flexible",), "t_end": 0.002, "cells": 4},
@@ -31,10 +34,13 @@ SMALL = {
     "stick_slip": {"floors": ("plane",), "dt": 8e-3, "cells": (2, 2, 1)},
     "two_blocks": {"t_end": 0.01, "cells": (1, 1)},
     "two_tori": {"t_end": 0.1},
+    "vehicle": {"facets": 16, "t_end": 0.02},
     "wheel": {"facets": 16, "dt": 4e-3, "duration": 0.012},
 }
 #: Equilibria alone, in which next to nothing moves.
 STILL = {"own_problem", "hertz", "partial_slip"}
+#: Bodies without meshes, which have no fields.
+BARE = {"mechanisms"}
 DEMOS = Path(__file__).resolve().parents[2] / "demos"
 
 
@@ -48,8 +54,10 @@ def test_what_a_demo_leaves(name, tmp_path, capfd):
     demo = importlib.import_module(name)
     demo.main(output=str(tmp_path), progress=True, **SMALL[name])
     assert "step/s" in capfd.readouterr().err.replace("s/step", "step/s")
-    for ending in (".png", ".xdmf", ".h5", *([] if name in STILL else [".gif"])):
+    fields = [] if name in BARE else [".xdmf", ".h5"]
+    for ending in (".png", *fields, *([] if name in STILL else [".gif"])):
         sizes = [path.stat().st_size for path in tmp_path.rglob(f"*{ending}")]
         assert sizes and min(sizes) > 500, ending
-    times = max(path.read_text().count("<Time Value") for path in tmp_path.rglob("*.xdmf"))
-    assert times >= 2
+    if fields:
+        times = [path.read_text().count("<Time Value") for path in tmp_path.rglob("*.xdmf")]
+        assert max(times) >= 2

@@ -8,7 +8,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.parallel import rank_of
+from dolfinx_nts.parallel import rank_of, sums_and_largest, together
 
 COMM = MPI.COMM_WORLD
 G = 9.81
@@ -108,3 +108,35 @@ def test_numbered_names_are_dealt_evenly(names, ranks):
     owners = [rank_of(names.format(k, k + 1), Comm) for k in range(100)]
     counts = np.bincount(owners, minlength=ranks)
     assert counts.max() - counts.min() <= 1
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("n", "m"), [(0, 2), (3, 0), (3000, 2000)])
+def test_sums_and_largest_values_of_all_ranks_come_in_one_call(n, m):
+    """Against NumPy with the values of all ranks at hand; a NaN anywhere is one everywhere."""
+    values = np.random.default_rng(1).normal(size=(COMM.size, n + m))
+    values[-1, n : n + 1] = np.nan
+    sums, largest = sums_and_largest(COMM, *np.split(values[COMM.rank], [n]))
+    assert np.abs(sums - values[:, :n].sum(axis=0)).max(initial=0.0) < 1e-13 * COMM.size
+    assert np.array_equal(largest, values[:, n:].max(axis=0), equal_nan=True)
+
+
+@pytest.mark.mpi
+def test_works_of_many_contacts_ask_all_ranks_together():
+    """Each is sent its own answers, however many questions the others have."""
+    def work(k):
+        last = yield COMM.rank == COMM.size - 1
+        none = yield False
+        sums, most = yield np.full((k, 2), COMM.rank + k), np.array([COMM.rank - k])
+        rows = yield np.full((COMM.rank + k % 2, 2), COMM.rank)
+        for _ in range(k):
+            yield True
+        return last, none, sums.tolist(), most.tolist(), rows[:, 0].tolist()
+
+    found = together(COMM, [work(k) for k in range(4)])
+    total = sum(range(COMM.size))
+    for k, (last, none, sums, most, rows) in enumerate(found):
+        assert last and not none
+        assert sums == 2 * k * [total + k * COMM.size] and most == [COMM.size - 1 - k]
+        assert rows == [rank for rank in range(COMM.size) for _ in range(rank + k % 2)]
+    assert together(COMM, []) == []

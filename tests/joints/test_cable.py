@@ -10,6 +10,7 @@ from scenes import RUBBER, box
 
 import dolfinx_nts as nts
 from dolfinx_nts.kernels.cable import Lengths, Stretched, turns
+from dolfinx_nts.output import Motions
 
 COMM = MPI.COMM_WORLD
 G = 9.81
@@ -74,7 +75,8 @@ def assert_closed(run, tolerance=1e-12):
 def test_atwoods_machine(rule, friction):
     """a = g (m_1 - m_2 e)/(m_1 + m_2 e), e = exp(mu pi), until the friction takes its part."""
     cable, system = atwood(friction=friction)
-    run = nts.simulate(system, rule, dt=0.01, t_end=0.2)
+    motions = Motions(cable)
+    run = nts.simulate(system, rule, dt=0.01, t_end=0.2, output=[motions])
     assert_closed(run)
     e = np.exp((friction or 0.0) * np.pi)
     fall = G * (3.0 - 2.0 * e) / (3.0 + 2.0 * e)
@@ -84,8 +86,13 @@ def test_atwoods_machine(rule, friction):
     ends = 3.0 * (G - fall), 2.0 * (G + fall)
     assert cable.tensions(run) == pytest.approx([ends[0], np.sqrt(np.prod(ends)), ends[1]])
     assert run.reactions["rope"][1:, 0, 2] == pytest.approx(ends[0])
+    sides = motions["rope tensions"][:, [0, -1]]
+    assert (sides[0] == 0.0).all() and np.allclose(sides[1:], ends, rtol=1e-9)
+    assert np.allclose(motions["rope"], [3.0, 0.0], atol=1e-12)
     lost = (ends[0] - ends[1]) * 0.5 * fall * 0.2**2
     assert run.balance["friction_dissipation"][-1] == pytest.approx(lost, abs=1e-12)
+    took = run.joint_works["friction_dissipation"]["rope"][-1]
+    assert took == pytest.approx(lost, abs=1e-12)
 
 
 @rules
@@ -107,6 +114,33 @@ def test_a_slack_cable_stops_a_weight_as_a_limit_does(rule):
     assert load.position == pytest.approx(twin.position, abs=1e-11)
     lost = run.balance["contact_defect"]
     assert lost[-1] > 0.1 and lost == pytest.approx(other.balance["contact_defect"], abs=1e-10)
+
+
+@rules
+@pytest.mark.parametrize("mu", [0.05, 0.3, 1.5])
+@pytest.mark.fast("0.3-energy-momentum")
+@pytest.mark.fast_on_ranks()
+def test_a_slack_cable_with_friction_becomes_taut_at_an_arm_that_rests_on_its_stop(rule, mu):
+    """As a slider on a rail with an end: the cable slips, and friction takes a part of the loss."""
+    load, arm = weight(3.0, (0, 0, -1.0)), weight(2.0, (1.0, 0, -0.5), "arm")
+    cable = nts.Cable(
+        [(arm, (1.0, 0, -0.5)), (None, (0, 0, 0)), (load, (0, 0, -1.0))],
+        length=WAY + 0.3, friction=mu, name="rope",
+    )  # fmt: skip
+    rail = nts.Prismatic(load, None, point=(0, 0, -1.0), axis=(0, 0, 1))
+    hinge = nts.Revolute(arm, None, point=(1.2, 0, -0.8), axis=(0, 1, 0), limits=(0.0, 1.0))
+    system = nts.System([load, arm], joints=[cable, rail, hinge], gravity=(0, 0, -G))
+    run = nts.simulate(system, rule, dt=0.01, t_end=0.6)
+    assert_closed(run)
+    twin = weight(3.0, (0, 0, -1.0))
+    end = nts.Prismatic(twin, None, point=(0, 0, -1.0), axis=(0, 0, 1), limits=(-0.3, np.inf))
+    alone = nts.System([twin], joints=[end], gravity=(0, 0, -G))
+    other = nts.simulate(alone, rule, dt=0.01, t_end=0.6)
+    assert load.position == pytest.approx(twin.position, abs=1e-11)
+    assert arm.position == pytest.approx((1.0, 0, -0.5), abs=1e-11)
+    taken, lost = (run.balance[k] for k in ("friction_dissipation", "contact_defect"))
+    assert taken[-1] > 0.05 * lost[-1]
+    assert taken + lost == pytest.approx(other.balance["contact_defect"], abs=1e-10)
 
 
 @pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)

@@ -217,6 +217,11 @@ def test_hinges_of_a_long_chain_begin_to_slip(bound):
     slips = np.diff(angles, prepend=0.0)
     assert slips == pytest.approx(0.5 * dt**2 * right, abs=1e-6 * dt**2 * np.abs(right).max())
     assert_closed(run)
+    took = run.joint_works["friction_dissipation"]
+    each = np.array([took[f"hinge {k} friction"][-1] for k in range(links)])
+    works = bound * 0.5 * dt**2 * np.abs(right)
+    assert each == pytest.approx(works, abs=1e-5 * works.max())
+    assert each.sum() == pytest.approx(run.balance["friction_dissipation"][-1], rel=1e-12)
 
 
 @rules
@@ -246,6 +251,21 @@ def test_a_controller_holds_an_angle(rule):
     assert angle(body) == pytest.approx(rest, abs=1e-6)
     if rule in MID_STEP.values():
         assert_closed(run)
+
+
+def test_a_motor_is_not_asked_about_an_iterate_that_runs_off():
+    """So that the step is cut, and the user's function is not blamed."""
+    asked = []
+
+    def motor(time, angle, rate):
+        asked.append((angle, rate))
+        return 2.0 * angle + rate
+
+    rod = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="rod")
+    hinge = nts.Revolute(rod, None, point=(0, 0, 0), axis=(0, 0, 1), motor=motor)
+    at, rate = np.array([np.nan, 0.5, 0.1]), np.array([1.0, 3.0, np.inf])
+    np.testing.assert_array_equal(hinge.parts[0].law._ask(0.0, at, rate), [np.nan, 4.0, np.nan])
+    assert asked == [(0.5, 3.0)]
 
 
 @pytest.mark.fast_on_ranks()
@@ -293,6 +313,8 @@ def test_laws_of_a_cylindrical_joint_act_on_its_way_and_its_angle(rule):
     assert np.arctan2(body.rotation[1, 0], body.rotation[0, 0]) == pytest.approx(-0.5, abs=1e-11)
     held = run.reactions["rail sliding limits"][-2:, 0, 2].mean()
     assert held == pytest.approx(-2.0, abs=1e-6)
+    means = run.mean_of_two_steps(run.reactions["rail sliding limits"])
+    assert means[-1, 0, 2] == pytest.approx(held, abs=1e-12)
 
 
 @rules
@@ -376,7 +398,7 @@ def test_wrong_laws(laws, error, text):
     ):
         with pytest.raises(ValueError, match=text):
             nts.JointFriction(**given)
-    with pytest.raises(ValueError, match="turning_friction=.*: pass the pin's radius=, too"):
+    with pytest.raises(ValueError, match="turning_friction=.*: pass its radius=, too"):
         pin(nts.JointFriction(coefficient=0.1), "turning_friction")
     with pytest.raises(ValueError, match="sliding_friction=.*: what slides has no radius"):
         pin(nts.JointFriction(coefficient=0.1, radius=0.1), "sliding_friction")

@@ -666,7 +666,8 @@ def number(_):
          "point of 'spherical of s and ground': .*9.0, 0.0, 0.0.*: lies in no cell of body 's'"),
         (lambda a, b, s: nts.Spherical(a, b, point=P, name=" "), ValueError, "name=' ': is empty"),
         (lambda a, b, s: nts.Spherical(a, b, point=P, axis=N), TypeError,
-         "axis=.*: unknown option of Spherical; choose from a, b, point, displacement, cone, name"),
+         "axis=.*: unknown option of Spherical; choose from a, b, point, displacement, cone, "
+         "friction, name"),
         (lambda a, b, s: nts.Universal(a, b, point=P, axes=(N, N)), ValueError,
          "axes=.* of 'universal of a and b': are not at right angles"),
         (lambda a, b, s: nts.Universal(a, b, point=P, axes=N), ValueError, "axes=.*pass two vec"),

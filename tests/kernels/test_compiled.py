@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 from mpi4py import MPI
 
@@ -45,7 +46,8 @@ def pairs(nc, friction, rule):
 @pytest.mark.parametrize("nc", KINDS)
 def test_elements_are_those_of_numpy(nc, friction):
     measure, x, multiplier = pairs(nc, friction, "mean-value")
-    here, there = measure._compiled(x, multiplier), measure._condensed(x, multiplier)
+    xi = measure.projection(x)
+    here, there = measure._compiled(x, xi, multiplier), measure._condensed(x, multiplier)
     for found, expected in zip(here[:3], there[:3], strict=True):
         assert relative(found, expected) < 1e-13
     assert (here[3] is None) == (there[3] is None) == (not friction)
@@ -173,6 +175,65 @@ def test_blurred_laws_hold_where_forces_are_theirs(gaps):
     assert relative(found, slope) < 1e-7
 
 
+def sliding(size, share):
+    """Pairs that slip by a size, with a share of Coulomb's bound as friction along the slip."""
+    measure, obeyed, x, _ = batches("friction", shared=True, prescribed=False, massless=False)
+    x[:] = measure.start
+    rng = np.random.default_rng(4)
+    x[:, 0] += size * rng.normal(size=(N, 3))
+    slip = measure.evaluate(x, None, np.zeros((N, 3))).slip
+    low = np.einsum("nab,nb->na", slip.metric, slip.value)
+    length = np.sqrt(np.einsum("na,na->n", low, slip.value))
+    press = 0.5 * obeyed.yielding
+    friction = (obeyed.friction * press * share / length)[:, None] * low
+    return measure, obeyed, x, np.column_stack([-press, friction]), length
+
+
+def test_steep_return_maps_tell_stick_from_slip_by_the_slip():
+    """A blurred law leaves sliding nodes below their bounds, and return maps let these stick."""
+    below = 1.0 - 0.5e-6  # a thousand widths away from sticking
+    measure, obeyed, x, given, length = sliding(1e-9, below)
+
+    def sticks(steep):
+        law = replace(obeyed, steep=steep)
+        here = law.obey(x, measure.evaluate(x, None, given), given, Together(0.0, 0.0, 0.0))
+        assert here.active.all()
+        return here.stick
+
+    assert sticks(0.0).all()
+    bound = -obeyed.friction * given[:, 0]
+    assert not sticks(bound / (10.0 * length)).any()
+    assert sticks(bound / (1e7 * length)).all()
+
+
+def test_rounding_of_slips_leaves_friction_as_unsure_as_said():
+    """A slip that is off, across itself, turns friction: by the same as rows miss."""
+    measure, obeyed, x, given, length = sliding(1e-3, 1.5)
+    law, off = replace(obeyed, steep=-obeyed.friction * given[:, 0] / length), 1e-9
+
+    def rows(measured):
+        return law.obey(x, measured, given, Together(0.0, 0.0, 0.0))
+
+    measured = [measure.evaluate(x, None, given) for _ in range(2)]
+    slip = measured[1].slip
+    low = np.einsum("nab,nb->na", slip.metric, slip.value)
+    across = np.column_stack([-low[:, 1], low[:, 0]])
+    long = np.sqrt(np.einsum("na,nab,nb->n", across, slip.metric, across))
+    slip.value[:] += off * across / long[:, None]
+    here, there = (rows(one) for one in measured)
+    assert not here.stick.any()
+    turned = (there.residual - here.residual)[:, -2:] / law.scale[:, None]
+    upper = np.linalg.inv(slip.metric)
+    turned = np.sqrt(np.einsum("na,nab,nb->n", turned, upper, turned))
+    part = SimpleNamespace(**here._asdict())
+    # Friction and trial have the slip's direction: the trial is 1.5 bounds and the slip's one.
+    found = law.unsure(part, off) * (1.0 + 1.0) / (1.5 + 1.0)
+    assert relative(found, turned) < 1e-5
+    part.end[:], part.distance[:], part.stick[:] = 0.0, 0.0, False
+    with np.errstate(all="raise"):
+        assert not law.unsure(part, off).any()
+
+
 @pytest.mark.parametrize("rule", ["mean-value", "direct"])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
@@ -245,7 +306,7 @@ def test_points_of_a_surface_are_summed_up(corners, nc, friction, rule):
         found = measure.evaluate(x, np.empty((N, 0)), of_points)
         own = found.residual, found.tangent, found.slip.gradient if friction else np.empty(0)
     start = measure.start, measure.normal, measure.xi, measure.length
-    here = compiled.over_surface(start, (x, xi), measure.theta, *given, own)
+    here = compiled.over_surface(start, (x, xi), measure.theta, compiled.Summed(*given), own)
     for found, expected in zip(here, there, strict=True):
         assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
 

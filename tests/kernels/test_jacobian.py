@@ -148,6 +148,20 @@ def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active
     assert max(errors.values()) < 1e-8, errors
 
 
+def along_ways(at):
+    """Errors of each block of the Jacobian along some directions."""
+    x, step = at.problem.x.array_r.copy(), 1e-4
+    ways = np.random.default_rng(3).uniform(-0.3, 0.3, (6, len(x)))
+    expected = np.zeros((len(x), len(ways)))
+    for j, way in enumerate(ways):
+        for k, weight in STENCIL:
+            expected[:, j] += weight / step * at.residual(x + k * step * way)
+    found = dense(at.solver.matrix.operator) @ ways.T
+    errors = [relative(found[rows], expected[rows]) for rows in at.blocks()]
+    at.close()
+    return errors
+
+
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize(("rule", "cell", "friction"), [
     ("condensed", "hex", "mixed"), ("midpoint", "hex", "slip"), ("gonzalez contact", "tet", "slip"),
@@ -159,15 +173,30 @@ def test_jacobian_of_a_law_after_sums(rule, cell, friction):
     system = two_blocks(cell, friction=FRICTION[friction], integration="surface")
     at = Linearised(system, rule, "mixed", rotated_state(system))
     assert at.candidates == 9 and 0 < at.active.sum() < 9
-    x, step = at.problem.x.array_r.copy(), 1e-4
-    ways = np.random.default_rng(3).uniform(-0.3, 0.3, (6, len(x)))
-    expected = np.zeros((len(x), len(ways)))
-    for j, way in enumerate(ways):
-        for k, weight in STENCIL:
-            expected[:, j] += weight / step * at.residual(x + k * step * way)
-    found = dense(at.solver.matrix.operator) @ ways.T
-    errors = [relative(found[rows], expected[rows]) for rows in at.blocks()]
-    at.close()
+    errors = along_ways(at)
+    assert max(errors) < 1e-8, errors
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+@pytest.mark.parametrize(("rule", "obstacle"), [
+    ("condensed", nts.Plane((0, 0, 1), (0, 0, 1))), ("midpoint", nts.Plane((0, 0, 1), (0, 0, 1))),
+    ("static", nts.Cylinder((0.4, 0, -2.0), (0, 1, 0), 3.0)),
+], ids=["plane-condensed", "plane-midpoint", "cylinder-static"])  # fmt: skip
+@pytest.mark.fast("cylinder-static")
+def test_jacobian_of_obstacles_over_the_surface(rule, obstacle):
+    """Tetrahedra of degree 2, nodes that stick and that slip."""
+    body = nts.Continuum(
+        box([0.07, 0.12, 1.01], [0.87, 0.92, 1.8], 1, CELLS["tet"]), nts.NeoHookean(1e3, 0.3),
+        density=1.0, degree=2, velocity=(0.3, 0.1, -0.2),
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        body.surface(lambda x: x[2] < 1.0101), obstacle, friction=FRICTION["mixed"],
+        integration="surface",
+    )  # fmt: skip
+    system = nts.System([body], contacts=[pair])
+    at = Linearised(system, rule, "mixed", system.initial_state())
+    assert at.candidates == 9 and 0 < at.active.sum() < 9
+    errors = along_ways(at)
     assert max(errors) < 1e-8, errors
 
 

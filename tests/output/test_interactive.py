@@ -25,6 +25,7 @@ def test_actors_are_where_bodies_are():
     assert actors["block"].bounds == pytest.approx((0.0, 1.5, 0.0, 1.0, 0.0, 1.0))
     assert actors["hard"].bounds == pytest.approx((2.0, 3.0, 0.0, 1.0, 0.0, 1.0))
     low, high = np.reshape(actors["obstacles"].bounds, (3, 2)).T
+    assert actors["obstacles from behind"].bounds == actors["obstacles"].bounds
     assert low[2] == high[2] == 0.0 and (low[:2] < 0.0).all() and (high[:2] > [3.0, 1.0]).all()
     assert {"lines", "points"} <= set(actors) and "axes" not in actors
     stretched = view([block], colour=nts.von_mises, limits=(0.0, 2e5)).mapper

@@ -506,7 +506,7 @@ def test_an_error_of_petsc_is_not_told_as_an_earlier_one():
     stepper.start(1e-2)
     evaluate, solver = stepper.problem.evaluate, stepper.solver
 
-    def raising(x):
+    def raising(*_):
         raise nts.StepFailedError("an early failure")
 
     stepper.problem.begin(stepper.state, 1e-2)

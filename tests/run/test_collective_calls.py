@@ -6,22 +6,26 @@ from collections import Counter
 from mpi4py import MPI
 
 import pytest
-from scenes import meeting_blocks
+from scenes import box, meeting_blocks
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
-#: A Newton iterate is agreed on: whether it is new (as residual, and as Jacobian), has moved, and
-#: whether its elements failed; norms of bodies, of elements, of both; whether the active set and
-#: the matrices stay. Two surfaces are gathered in it.
-OF_ITERATE = 11
-#: Search 12, edges 4, layout and limits 7, ledger 7, looks for what is wrong 4, and in some steps
-#: looks for warnings 11.
-OF_STEP = 45
-#: Objects travel pickled, in messages and two broadcasts: for warnings 10, and rows of whose number
-#: other ranks do not know 6. Flags and positions do not.
-PICKLED = 16
+#: What ranks agree on at an iterate: is it new, did elements raise, which bodies and statuses have
+#: changed, how far all moved; then norms, and whether it is what SNES has.
+OF_ITERATE = 2
+#: Where points of rigid bodies touch that share a load: their mean force before, and all their rows
+#: after that.
+OF_SHARED_LOAD = 2
+#: A solution: which bodies moved since t_n, and their det F, or candidates that it wakes.
+OF_SOLUTION = 2
+#: Search 9, positions 4, what came before and predicted lengths 3, layout and gaps of flight 3, a
+#: solution 4, ledger 2, looks for what is wrong 2; and in some steps for warnings 6.
+OF_STEP = 33
+#: Objects travel pickled, in messages and two broadcasts: rows of whose number other ranks do not
+#: know. Flags and positions do not.
+PICKLED = 4
 
 
 def calls_in(work):
@@ -41,10 +45,25 @@ def calls_in(work):
     return found
 
 
-def test_a_step_has_few_collective_calls():
-    """And flags travel as numbers, positions as they are."""
+def resting():
+    """Two rigid cubes on a rubber one's place each: eight nodes touch where six hold them."""
+    floor = nts.Plane((0, 0, 0), normal=(0, 0, 1))
+    cubes = [
+        nts.RigidBody(box([2.0 * k, 0, 0], [2.0 * k + 1, 1, 1], 2), density=1e3, name=f"cube {k}")
+        for k in range(2)
+    ]
+    pairs = [nts.ContactPair(c.surface(lambda x: x[2] < 1e-9), floor) for c in cubes]
+    return nts.System(cubes, contacts=pairs, gravity=(0, 0, -9.81))
+
+
+def needs_a_profiler():
     if not calls_in(COMM.Barrier):
         pytest.skip("methods of this mpi4py are no C functions to Python's profiler")
+
+
+def test_a_step_has_few_collective_calls():
+    """And flags travel as numbers, positions as they are."""
+    needs_a_profiler()
     stepper = nts.Stepper(meeting_blocks(), nts.EnergyMomentum())
     for _ in range(3):  # contact begins, and what follows it
         stepper.advance(1e-3)
@@ -53,3 +72,22 @@ def test_a_step_has_few_collective_calls():
     stepper.close()
     assert sum(calls.values()) <= OF_STEP + OF_ITERATE * (iterations + 1)
     assert calls["allreduce"] + calls["allgather"] <= PICKLED
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@pytest.mark.fast_on_ranks("False", "True")
+def test_an_iteration_has_two_reductions(rigid):
+    """Two more where rigid bodies share loads, however many contacts there are."""
+    needs_a_profiler()
+    system = resting() if rigid else meeting_blocks()
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    for _ in range(3):
+        stepper.advance(1e-3)
+    assert stepper.solution.rows[-1]["active"] > 0
+    stepper.problem.begin(stepper.state, 1e-3)
+    calls, solver = calls_in(stepper.solver.solve), stepper.solver
+    iterates = solver.snes.getIterationNumber() + 1
+    stepper.close()
+    each = OF_ITERATE + (OF_SHARED_LOAD if rigid else 0)
+    assert sum(calls.values()) <= each * iterates + OF_SOLUTION
+    assert not calls["allreduce"] + calls["allgather"]

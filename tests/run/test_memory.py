@@ -194,9 +194,10 @@ assert stepper.solution.balance["active"].any()
 
 
 @pytest.mark.slow
-def test_a_stepper_that_nobody_closes_ends_with_python():
+@pytest.mark.parametrize("then", ["", "del stepper"], ids=["kept", "dropped"])
+def test_a_stepper_that_nobody_closes_ends_with_python(then):
     """PETSc would free the preconditioners that Python serves after Python has gone."""
-    in_fresh_python(LEFT_OPEN)
+    in_fresh_python(LEFT_OPEN + then)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from integrators import MID_STEP
 from scenes import RUBBER, bottom, box, fail_once, top
 
 import dolfinx_nts as nts
+from dolfinx_nts.run.load_steps import LoadStepper
 from dolfinx_nts.validation import StepFailedError
 
 COMM = MPI.COMM_WORLD
@@ -88,6 +89,47 @@ def test_parts_of_a_cut_step_grow_again(monkeypatch):
     assert times[-1] == 1.0 and steps[0] == pytest.approx(1 / 127)
     assert len(steps) < 127 / 3 and steps.max() > 5 * steps[0]
     assert body.position[0] == pytest.approx(1.0, rel=1e-12)
+
+
+@pytest.mark.mpi
+def test_a_step_that_fails_among_alike_laws_in_joints_says_so():
+    bodies = [
+        nts.RigidBody.from_inertia(1.0, 3 * [0.1], (x, 0, 0), name=f"weight {x}", comm=COMM)
+        for x in (0, 1, 2)
+    ]
+    joints = [
+        nts.Prismatic(body, None, point=body.position, axis=(1, 0, 0), limits=(-0.1, 0.1))
+        for body in bodies
+    ]
+    run = nts.simulate(
+        nts.System(bodies, joints=joints, gravity=(1.0, 0, 0)), nts.EnergyMomentum(), dt=0.1,
+        t_end=1.0, newton=nts.Newton(max_iterations=1, max_retries=1),
+    )  # fmt: skip
+    assert run.status.startswith("step from t=") and "body 'weight 0" in run.status
+
+
+@pytest.mark.parametrize("statics", [False, True], ids=["in time", "load steps"])
+def test_what_fails_in_the_smallest_steps_is_not_told_to_try_smaller_ones(statics, monkeypatch):
+    """Eight cuts leave 1/511 of a step. A script prints the status: the log has its headline."""
+
+    def fails(*_):
+        raise nts.StepFailedError("step not solved (SNES reason -5); worst block 'left'")
+
+    monkeypatch.setattr(LoadStepper if statics else nts.Stepper, "_step", fails)
+    said: list[str] = []
+    log = "dolfinx_nts.run.simulate.logger.warning"
+    monkeypatch.setattr(log, lambda text, *of, **_: said.append(text % of))
+    system = two_blocks.scene(COMM)
+    if statics:
+        run = nts.equilibrium(system)
+    else:
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=2e-3)
+    smaller = "more load steps hardly help" if statics else "a smaller dt hardly helps"
+    far = f"Steps of 0.002 of the length asked for fail, too, so that {smaller}"
+    assert run.retries == 8 and far in run.status
+    assert "Try" not in run.status and run.status.count("worst block") == 1
+    assert run.summary.splitlines()[0] == run.status
+    assert [text.split(":")[0] for text in said] == ["step not solved"]
 
 
 @pytest.mark.mpi

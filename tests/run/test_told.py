@@ -125,6 +125,7 @@ def test_energy_lost_to_contact(theta):
     if theta == 0.5:
         warning = run.warnings["energy lost to contact"]
         assert warning.worst == pytest.approx(energy, rel=1e-12) and not warning.grave
+        assert f"most at {system.contacts[0].name!r}" in warning.text
 
 
 @pytest.mark.parametrize("low", [0.03, 0.5])

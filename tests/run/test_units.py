@@ -95,3 +95,13 @@ def test_a_run_and_an_equilibrium_tell_it():
     assert not nts.equilibrium(scene(2.1e11, 7.8)).warnings
     soft = nts.equilibrium(scene(210.0, 7800.0), load_steps=[1e-5])
     assert "less than any material has" in soft.warnings["units"].text
+
+
+def test_limits_in_degrees_are_told():
+    for limits, told in (((-90, 30), True), ((-1.5, 0.5), False), ((-7.25, 8.5), False)):
+        arm = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="arm")
+        hinge = nts.Revolute(
+            arm, None, point=(0, 0, 0), axis=(0, 0, 1), limits=limits, name="hinge"
+        )
+        found = list(doubtful_units(nts.System([arm], joints=[hinge]), in_time=True))
+        assert [name for name, *_ in found] == ["hinge limits"] * told

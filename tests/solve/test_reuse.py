@@ -193,8 +193,8 @@ def test_a_failed_step_leaves_no_trace(monkeypatch):
     state, problem = stepper.state, stepper.problem
     evaluate = problem.evaluate
 
-    def broken(x):
-        e = evaluate(x)
+    def broken(*at):
+        e = evaluate(*at)
         for c in e.parts:
             c.tangent[:] = np.nan
             c.residual[:] = np.nan
@@ -397,7 +397,7 @@ def test_what_rests_or_is_not_there_is_evaluated_once_a_step():
             counting(pair, "positions"), counting(stepper.problem, "_parts_of_elements"),
         ]  # fmt: skip
         if not remember:
-            stepper.problem.elsewhere = lambda values, known, p=stepper.problem: list(p.awake)
+            stepper.problem._moves = lambda *_, p=stepper.problem: [1.0] * len(p.laid.awake)
         for _ in range(4):
             stepper.advance(1e-3)
         calls.append([len(count) for count in counts])

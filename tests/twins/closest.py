@@ -4,7 +4,7 @@ import numpy as np
 
 from dolfinx_nts.kernels.compiled import COLLINEAR
 from dolfinx_nts.kernels.facets import (
-    _REFERENCE,
+    CORNERS,
     EPS,
     LAST_STEP,
     _bilinear,
@@ -104,7 +104,7 @@ def _is_convex(g: np.ndarray) -> np.ndarray:
     in_t = _least(g[2, 2], g[2, 3], g[3, 3])
     mixed = [
         np.abs(g[0, 3] + g[1, 2] + 2.0 * (g[1, 3] * s + g[2, 3] * t + g[3, 3] * s * t))
-        for s, t in _REFERENCE[4]
+        for s, t in CORNERS[4]
     ]
     return (in_s > 0.0) & (np.max(mixed, axis=0) ** 2 < in_s * in_t)
 

@@ -29,7 +29,9 @@ class RigidBatch(BodyBatch):
 
     def __init__(self, bodies: Sequence[RigidBody], numbers: IntArray) -> None:
         super().__init__(bodies, numbers, 3, "rigid bodies")
-        self._order = np.argsort([body.owner for body in bodies], kind="stable").tolist()
+        owners = [body.owner for body in bodies]
+        self._order = np.argsort(owners, kind="stable").tolist()
+        self._counts, self._shared = np.bincount(owners, minlength=self.comm.size), 0
         self._lent = np.concatenate([np.empty(0), *(body.lent for body in self._own)])
         self._reach = np.array([body.reach for body in self._own]).reshape(-1, 4)
         self._matrix: Any = None
@@ -79,8 +81,23 @@ class RigidBatch(BodyBatch):
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the members' current state. Collective."""
         local = np.reshape([self.reference + u, u, v], (3, -1, 4, 3)).swapaxes(0, 1)
-        for k, seen in zip(self._order, gather_rows(self.comm, local), strict=True):
+        for k, seen in zip(self._order, self._gathered(local), strict=True):
             self._bodies[k].show(*seen)
+
+    def share(self, *values: Sequence[FloatArray]) -> None:
+        """Let all ranks know values at owned coordinates, of each body of the system. Collective.
+
+        The members remember those of the last two calls.
+        """
+        local = np.stack([self.joined(each).reshape(-1, 4, 3) for each in values], axis=1)
+        for k, tables in zip(self._order, self._gathered(local), strict=True):
+            body, own = self._bodies[k], [each[self.members[k]] for each in values]
+            body.known = (*zip(own, tables, strict=True), *body.known[: self._shared])
+        self._shared = len(values)
+
+    def _gathered(self, local: FloatArray) -> FloatArray:
+        """What the ranks have of each of their members, in the order `_order`. Collective."""
+        return gather_rows(self.comm, local, self._counts)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

@@ -38,7 +38,7 @@ from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
-from dolfinx_nts.parallel import anywhere, gather_on_root, raise_together
+from dolfinx_nts.parallel import anywhere, gather_on_root, global_sum, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Places, Settings, Values
 from dolfinx_nts.validation import UserFunctionError, require_bool, require_name, vectors
 
@@ -82,6 +82,7 @@ class UflBody(MeshBody):
         self.num_owned = 3 * space.dofmap.index_map.size_local
         self.reference = space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self._stiffness: FloatArray | None = None
+        self._meant: tuple[FloatArray, float] | None = None
         self._given_density: Parameter | None = None
         self.allow_inversion = allow_inversion
         # Cells of a surface or a line have no inside.
@@ -285,9 +286,11 @@ class UflBody(MeshBody):
         return self._mass.corrected(matrix, mass)
 
     def _mean(self, values: FloatArray) -> float:
-        """Over all coordinates. Collective."""
-        total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
-        return float(total[0] / total[1])
+        """Over all coordinates, known as long as the array is the same object. Collective."""
+        if self._meant is None or self._meant[0] is not values:
+            total = global_sum(self.comm, np.array([values.sum(), self.num_owned]))
+            self._meant = values, float(total[0] / total[1])
+        return self._meant[1]
 
     def nodal_stiffness(self) -> FloatArray:
         """Mean diagonal of the tangent in equilibrium at each node, without deformation [N/m]."""
