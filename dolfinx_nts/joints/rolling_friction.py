@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -48,18 +48,11 @@ class _RollsAndSpins(Turn):
     axes = slice(0, 3)
 
 
-class _Arms(NamedTuple):
-    """Bounds of moments over the normal force.
-
-    Attributes:
-        arms: Of each measure [m], shape (m,).
-    """
-
-    arms: FloatArray
-
-
 class _RollingElements(DirectedElements):
-    """`DirectedElements` whose measures follow the contact's normal, and their bounds its force."""
+    """`DirectedElements` whose measures follow the contact's normal, and their bounds its force.
+
+    The law has each measure's bound over the force [m], shape (m,).
+    """
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Asking[DirectedPart]:
         """Residual and tangent."""
@@ -67,7 +60,7 @@ class _RollingElements(DirectedElements):
         load, kind = max(float(sums[0]), 0.0), self.measure.kind
         turned = triad(own["normal"])[kind.axes] @ self.since[:, :3].swapaxes(1, 2)
         forms = np.einsum("nak,nkvw->navw", turned, self.forms)
-        arms = np.tile(self.law.arms, (len(x), 1))
+        arms = np.tile(self.law, (len(x), 1))
         slopes = arms[:, :, None] * (load > 0.0) * own["by_unknowns"][:, None]
         return self._obeyed(x, own["constraints"], forms, arms * load / self.step.factor, slopes)
 
@@ -88,7 +81,7 @@ class RollingFriction(OfTwo):
     up to the slope tan(alpha) = rolling / r. Pass it among the `joints` of the system:
 
         floor = nts.Plane((0, 0, 0), (0, 0, 1))
-        pair = nts.ContactPair(ball.surface(), floor, friction=0.5)
+        pair = nts.ContactPair(ball.surface(skin), floor, friction=0.5)
         drag = nts.RollingFriction(pair, rolling=1e-3, spinning=2e-4)
         system = nts.System([ball], contacts=[pair], joints=[drag], gravity=(0, 0, -9.81))
 
@@ -133,7 +126,7 @@ class RollingFriction(OfTwo):
         self.pressed_by = pair
         self._given = {"rolling": float(rolling), "spinning": float(spinning)}
         kind = _RollsAndSpins if rolling and spinning else _Rolls if rolling else _Spins
-        self.law = _Arms(np.array([rolling, rolling, spinning], dtype=float)[kind.axes])
+        self.law = np.array([rolling, rolling, spinning], dtype=float)[kind.axes]
         both = [body.directions(np.eye(3)) for body in self.bodies]
         widths = [points.weights.shape[1] for points in both]
         weights, constants = np.zeros((6, sum(widths))), np.zeros((6, 3))
