@@ -76,7 +76,6 @@ def test_spin_falls_in_a_line_and_ends(rule):
     run = nts.simulate(system, rule, dt=dt, t_end=0.5)
     assert_closed(run)
     time, kinetic = (run.balance[name] for name in ("time", "kinetic"))
-    inertia, rate = body.moments[2], arm * body.mass * G / body.moments[2]
     inertia = body.mass * 2 * 0.2**2 / 12
     rate = arm * body.mass * G / inertia
     expected = 0.5 * inertia * np.maximum(spin - rate * time, 0.0) ** 2
@@ -119,11 +118,12 @@ def test_a_wheel_stays_on_a_slope_up_to_its_bound(facets, part, rolls):
     assert_closed(run, weight)
     way = np.linalg.norm(body.position - start)
     assert way > 1e-4 * RADIUS if rolls else way < 1e-10 * RADIUS
-    moment = run.reactions[law.name][1:, 1, 1]
-    held = weight * (slope * np.cos(edge) - np.sin(edge)) / np.hypot(1.0, slope)
     if not rolls:
-        pairs = 0.5 * (moment[1:] + moment[:-1])
-        assert pairs[-1] == pytest.approx(-held, abs=0.03 * held)
+        # Both rows of nodes may press, so that the moment has a range.
+        push = weight / np.hypot(1.0, slope)
+        least = push * (slope * np.cos(edge) - np.sin(edge))
+        moment = -run.mean_of_two_steps(run.reactions[law.name])[-1, 1, 1]
+        assert least * (1 - 1e-6) <= moment <= arm / RADIUS * push * (1 + 1e-6)
 
 
 @rules
