@@ -65,6 +65,7 @@ from dolfinx_nts.joints.actuators import Thrust, Torque
 from dolfinx_nts.joints.cable import Cable
 from dolfinx_nts.joints.forces import AboutAxis, BetweenPoints
 from dolfinx_nts.joints.laws import JointFriction
+from dolfinx_nts.joints.rolling_friction import RollingFriction
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
@@ -148,6 +149,7 @@ __all__ = [
     "Rectangle",
     "Restart",
     "RigidBody",
+    "RollingFriction",
     "Row",
     "Saved",
     "Seam",

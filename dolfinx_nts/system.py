@@ -162,6 +162,12 @@ class System:
         if both:
             raise ValueError(f"joints, bodies: both have the names {both}; rename the joints")
         for joint in self.joints:
+            pair = getattr(joint, "pressed_by", None)
+            if pair is not None and not any(pair is other for other in self.contacts):
+                raise ValueError(
+                    f"joints: {joint.name!r} is of contact {pair.name!r}, which is not among "
+                    "contacts; add it"
+                )
             for body in joint.bodies:
                 if not any(body is b for b in self.bodies):
                     raise ValueError(

@@ -15,29 +15,17 @@ from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.contact.edge_contact import EdgeElements
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
+from dolfinx_nts.equations.leaning import BearingLoad, Load, PressingLoad
 from dolfinx_nts.equations.least_norm import hanging
 from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Coupling, JointCoupling
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.measured import Measured, MeasuredPart, leans, rubs
+from dolfinx_nts.parallel import Asking, together
 from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray, IntArray
-
-
-class Load(NamedTuple):
-    """Whose multipliers a law depends on.
-
-    Attributes:
-        batch: Number of the batch that has them.
-        rows: Its elements on this rank, one of each element of the law's.
-        bearing: How many multipliers of each, the first ones.
-    """
-
-    batch: int
-    rows: IntArray
-    bearing: int
+from dolfinx_nts.types import FloatArray
 
 
 class OfJoints(NamedTuple):
@@ -73,7 +61,8 @@ class Couplings:
         linked = _linked(system.joint_bodies[:declared])
         self.mechanisms = max(linked, default=-1) + 1
         self._linked = [np.array([linked[k] for k in of if k < declared]) for _, of in self.joints]
-        self._loads = self._bearings(system)
+        self._loads, self._pressed = self._bearings(system), self._pressing(system)
+        self._comm, self._contact_of = system.comm, system.contact_of
         # Batches of elements of contacts and of edges in the step, which come first.
         self.num_touching = 0
 
@@ -91,6 +80,15 @@ class Couplings:
             k: (*places[id(law.of)], law.of.bearing)
             for k, (_, (n, *_)) in enumerate(self.joints)
             if leans(getattr(law := system.joints[n], "law", None))
+        }
+
+    def _pressing(self, system: System) -> dict[int, int]:
+        """Number among `joints` of each law that depends on a contact, and that of the contact."""
+        number = {id(pair): k for k, pair in enumerate(system.contacts)}
+        return {
+            k: number[id(pair)]
+            for k, (_, (n, *_)) in enumerate(self.joints)
+            if (pair := getattr(system.joints[n], "pressed_by", None)) is not None
         }
 
     @property
@@ -146,35 +144,53 @@ class Couplings:
                 np.maximum.at(found, 1 + of, batch.extents if np.ndim(of) else batch.extent)
         return found
 
-    @property
     def loads(self) -> dict[int, Load]:
-        """Of the batches among `elements` whose laws depend on what their joints carry."""
-        if not self._loads:
+        """Of the batches among `elements` whose laws lean on others' forces. Collective."""
+        if not (self._loads or self._pressed):
             return {}
         starts = np.cumsum([self.num_touching, *(len(c.elements) for c, _ in self.joints)]).tolist()
-        found = {}
+        found: dict[int, Load] = {}
         for i, (k, row, bearing) in self._loads.items():
             (batch,) = self.joints[k].coupling.elements
-            found[starts[i]] = Load(starts[k], np.flatnonzero(batch.joint == row), bearing)
+            rows = np.flatnonzero(batch.joint == row)
+            found[starts[i]] = BearingLoad(starts[k], rows, bearing)
+        pressing = together(self._comm, [self._load_of(i) for i in self._pressed])
+        found |= zip((starts[i] for i in self._pressed), pressing, strict=True)
         return found
+
+    def _load_of(self, i: int) -> Asking[PressingLoad]:
+        """What a law leans on that depends on a contact, as of `parallel.together`.
+
+        Args:
+            i: Its number among `joints`.
+        """
+        contact, (law,) = self._pressed[i], self.joints[i].coupling.elements
+        numbers = [self._contact_of[k] for k in self.contacts.numbers]
+        batches = [k for k, of in enumerate(numbers) if of == contact]
+        guesses = [self.contacts.carried(k) for k in batches]
+        start = len(numbers)
+        for k, edges in self.contacts.edges.items():
+            for j, batch in enumerate(edges.elements):
+                if k == contact:
+                    batches.append(start + j)
+                    guesses.append(edges.guess(j, batch.reference()))
+            start += len(edges.elements)
+        return PressingLoad.of(
+            self._comm, batches, self.elements, guesses, law.num_elements
+        )
 
     def tell_loads(
         self, own: Sequence[dict[str, FloatArray]], loads: Mapping[int, Load]
     ) -> None:
-        """Add to the unknowns of laws that depend on it what their joints carry.
-
-        That is "load", the force of a joint's bearing times the factor of the step, (n, bearing),
-        and "by_unknowns", its derivative by each of these unknowns, (n, 1).
+        """Add to the unknowns of laws what the forces are that they lean on, see `Load.told`.
 
         Args:
             own: Of each of `elements` its own unknowns, see `Unknowns.own_values`.
             loads: `loads` of these elements.
         """
         elements = self.elements if loads else []
-        for i, (k, rows, bearing) in loads.items():
-            scale = elements[k].scale[rows, None]
-            own[i]["load"] = scale * own[k]["constraints"][rows, :bearing]
-            own[i]["by_unknowns"] = scale
+        for i, load in loads.items():
+            own[i].update(load.told(elements, own))
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""

@@ -244,7 +244,7 @@ class StepProblem:
         combined = [a for c in elements if c.combination is not None for a in c.combination]
         places = [a for c in elements for a in c.points()]
         numbers = (np.array(self.awake), widths, *places, *combined)
-        self._bearing = self.couplings.loads
+        self._bearing = self.couplings.loads()
         contacts = self.couplings.contacts
         # From bodies that free flight has pressed deep into each other iterates may not find back.
         dives = [contacts.dives()] if self.integrator.inertia else []

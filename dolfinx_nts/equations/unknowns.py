@@ -13,6 +13,7 @@ from petsc4py import PETSc
 from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
+from dolfinx_nts.equations.leaning import Load
 from dolfinx_nts.interaction.combination import num_multipliers, of_multipliers
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -46,7 +47,7 @@ class Unknowns:
         awake: Sequence[int],
         elements: Sequence[Any],
         bodies: Sequence[tuple[int, ...]],
-        loads: Mapping[int, Any] = MappingProxyType({}),
+        loads: Mapping[int, Load] = MappingProxyType({}),
     ) -> None:
         comm = batches.comm
         self._batches = batches
@@ -102,7 +103,7 @@ class Unknowns:
         return np.where(own < 0, own, self.layout.to_system(field, own))
 
     def _blocks(
-        self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]], loads: Mapping[int, Any]
+        self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]], loads: Mapping[int, Load]
     ) -> list[ElementBlocks]:
         """Numbers of the elements' unknowns in their fields."""
         blocks = []
@@ -140,12 +141,9 @@ class Unknowns:
                 fields, tuple(columns), tuple(numbers), pattern, entries, weights
             )
             if i in loads:
-                k, rows, bearing = loads[i]
-                width, start = elements[k].widths["constraints"], starts[k]
-                first = self.layout.start(self.own["constraints"]) + start + width * rows
-                block = block.with_columns(
-                    self.own["constraints"], first[:, None] + np.arange(bearing)
-                )
+                field = self.own["constraints"]
+                first = [self.layout.start(field) + start for start in starts]
+                block = block.with_columns(field, loads[i].columns(elements, first))
             blocks.append(block)
         return blocks
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.joints.between import OfTwo
 from dolfinx_nts.joints.laws import Bound, JointFriction
+from dolfinx_nts.parallel import Asking
 from dolfinx_nts.state import State
 from dolfinx_nts.types import BoolArray, FloatArray
 
@@ -37,7 +38,7 @@ class Turn:
     a_2, a_3 as the step begins, b_1, b_2, b_3, it is the sum of b_i x a_i over 2 in these.
     """
 
-    num_measures = 3
+    groups: tuple[int, ...] = (3,)
 
     @staticmethod
     def forms(start: FloatArray) -> FloatArray:
@@ -51,7 +52,7 @@ class Turn:
 class Across:
     """The way of a point in a plane, (m_1 . r, m_2 . r) [m], of the vectors m_1, m_2 and r."""
 
-    num_measures = 2
+    groups = (2,)
 
     @staticmethod
     def forms(start: FloatArray) -> FloatArray:
@@ -67,7 +68,7 @@ class DirectedPart(NamedTuple):
     Attributes:
         residual: Rows of coordinates and of multipliers [kg m].
         tangent: Its derivative.
-        status: Whether it sticks, shape (1, n).
+        status: What sticks of its groups, shape (groups, n).
         memory: D, and the vectors where the slip began, shape (n, m + 3 v).
         work: Of D against the motion of the step [J], shape (n,).
     """
@@ -84,7 +85,8 @@ class DirectedElements(PointElements):
     """Friction with a direction in a step, on the rank that has it.
 
     Attributes:
-        measure: The vectors that the measures are of.
+        measure: The vectors that the measures are of. Its kind has `groups`, how many measures at
+            a time have a bound and a direction in common, and their `forms`.
         law: The bound of the size of their forces.
         step: The step.
         y0: Nodal vectors at t_n [m], shape (n, k, 3).
@@ -94,7 +96,7 @@ class DirectedElements(PointElements):
     """
 
     measure: Measure
-    law: Bound
+    law: Any
     step: Step
     y0: FloatArray
     since: FloatArray
@@ -109,7 +111,7 @@ class DirectedElements(PointElements):
     @cached_property
     def widths(self) -> Mapping[str, int]:
         """A multiplier for each measure."""
-        return {"augmented": 0, "constraints": self.measure.kind.num_measures}
+        return {"augmented": 0, "constraints": sum(self.measure.kind.groups)}
 
     @property
     def force_scale(self) -> FloatArray:
@@ -122,34 +124,55 @@ class DirectedElements(PointElements):
         found: FloatArray = self.measure.kind.forms(self.since)
         return found
 
-    def _at(self, p: FloatArray) -> FloatArray:
-        """The measures of vectors p, shape (n, m)."""
-        return 0.5 * np.einsum("nvi,nkvw,nwi->nk", p, self.forms, p)
-
-    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> DirectedPart:
+    def evaluate(
+        self, x: FloatArray, own: Mapping[str, FloatArray]
+    ) -> DirectedPart | Asking[DirectedPart]:
         """Residual and tangent."""
+        law: Bound = self.law
+        if not law.by_load:
+            bound = np.broadcast_to(law.bound, (len(x), 1))
+            return self._obeyed(x, own["constraints"], self.forms, bound)
+        load = np.linalg.norm(own["load"], axis=1)[:, None]
+        across = own["load"] / np.maximum(load, TINY) * own["by_unknowns"]
+        bound, slopes = law.by_load * load / self.step.factor, law.by_load * across[:, None]
+        return self._obeyed(x, own["constraints"], self.forms, bound, slopes)
+
+    def _obeyed(
+        self, x: FloatArray, force: FloatArray, forms: FloatArray, bound: FloatArray,
+        slopes: FloatArray | None = None,
+    ) -> DirectedPart:  # fmt: skip
+        """What `evaluate` returns.
+
+        Args:
+            x: As of `evaluate`.
+            force: The multipliers [m], shape (n, m).
+            forms: Of the measures, see `Turn.forms`.
+            bound: Of each measure's group, shape (n, m) or (n, 1).
+            slopes: Derivatives of the bound times the factor of the step by the unknowns of others,
+                shape (n, m, columns) or (n, 1, columns).
+        """
         measure, factor, unit = self.measure, self.step.factor, self.force_scale
-        force, (n, m) = own["constraints"], own["constraints"].shape
-        size, theta, law = self.num_coordinates, self.step.integrator.taken_at, self.law
-        forms = self.forms
+        size, theta, (n, m) = self.num_coordinates, self.step.integrator.taken_at, force.shape
         start, end = measure.vectors(self.y0), measure.vectors(x)
         share = 0.5 if theta is None else theta
         mean, after = (
             measure.weights[:, None].swapaxes(2, 3) @ (forms @ p[:, None])
             for p in (start + share * (end - start), end)
         )
-        slip = measure.length[:, None] * (self._at(end) - self._at(self.since))
-        if law.by_load:
-            load = np.linalg.norm(own["load"], axis=1)
-            law = law.under(load / factor)
-        most = np.broadcast_to(law.bound / unit * factor, (n,))[:, None]
+        moved, before = (
+            0.5 * np.einsum("nvi,nkvw,nwi->nk", p, forms, p) for p in (end, self.since)
+        )
+        slip = measure.length[:, None] * (moved - before)
+        most = bound / unit[:, None] * factor
         trial = force + slip
-        reach = np.linalg.norm(trial, axis=1)[:, None]
-        stick = reach <= most
+        of = np.repeat(np.arange(len(measure.kind.groups)), measure.kind.groups)
+        alike = (of[:, None] == of).astype(float)
+        reach = np.sqrt(np.square(trial) @ alike)
+        stick = np.broadcast_to(reach <= most, (n, m))
         way = trial / np.maximum(reach, TINY)
         # How the bound's force turns with the trial.
         turns = np.where(stick, 0.0, most / np.maximum(reach, TINY))[:, :, None] * (
-            np.eye(m) - way[:, :, None] * way[:, None]
+            np.eye(m) - way[:, :, None] * way[:, None] * alike
         )
         value = np.where(stick, slip, force - most * way)
         by_slip = np.where(stick[:, :, None], np.eye(m), -turns)
@@ -167,21 +190,21 @@ class DirectedElements(PointElements):
         tangent[:, :size, size:] = unit[:, None, None] * along.swapaxes(1, 2)
         tangent[:, size:, :size] = unit[:, None, None] * (by_slip @ after.reshape(n, m, size))
         tangent[:, size:, size:] = self.scale[:, None, None] * by_force
-        if law.by_load:
-            across = own["load"] / np.maximum(load, TINY)[:, None] * own["by_unknowns"]
-            by_bound = np.where(stick, 0.0, -way) * law.by_load / measure.length[:, None]
-            more = np.zeros((n, size + m, across.shape[1]))
-            more[:, size:] = by_bound[:, :, None] * across[:, None]
+        if slopes is not None:
+            by_bound = np.where(stick, 0.0, -way) / measure.length[:, None]
+            more = np.zeros((n, size + m, slopes.shape[2]))
+            more[:, size:] = by_bound[:, :, None] * slopes
             tangent = np.concatenate([tangent, more], axis=2)
-            tangent = np.pad(tangent, ((0, 0), (0, across.shape[1]), (0, 0)))
+            tangent = np.pad(tangent, ((0, 0), (0, slopes.shape[2]), (0, 0)))
         pull = unit[:, None] / factor * force
         memory = np.concatenate([pull, self.since.reshape(n, wide)], axis=1)
         if theta is None or not self.step.integrator.inertia:
-            moved = slip / measure.length[:, None]
+            moved = moved - before
         else:
             moved = np.einsum("nka,na->nk", along, (x - self.y0).reshape(n, size))
         work = np.einsum("nk,nk->n", pull, moved)
-        return DirectedPart(residual, tangent, stick.T, memory, work)
+        _, first = np.unique(of, return_index=True)
+        return DirectedPart(residual, tangent, stick[:, first].T, memory, work)
 
     def ledger(self, part: DirectedPart, factor: float) -> dict[str, float]:
         """What it takes [J]."""
@@ -200,19 +223,27 @@ class DirectedElements(PointElements):
 
 
 class DirectedCoupling(EveryStep):
-    """Makes `DirectedElements` in every step, and remembers forces and where the slip began."""
+    """Makes `DirectedElements` in every step, and remembers forces and where the slip began.
 
-    def __init__(self, bodies: tuple[int, ...], joint: DirectedFriction) -> None:
+    Args:
+        bodies: Numbers of its bodies in the system.
+        joint: Its scene's part: name, measure and law.
+    """
+
+    #: Class of its elements.
+    _of: ClassVar[type[DirectedElements]] = DirectedElements
+
+    def __init__(self, bodies: tuple[int, ...], joint: Any) -> None:
         super().__init__(bodies, self._elements, lambda part: part.memory)
         self._joint = joint
 
     def _elements(self, step: Step, history: FloatArray) -> DirectedElements:
         joint, measure = self._joint, self._joint.measure
         y0 = measure.reference() + measure.nodal([step.state.u[b] for b in self.bodies[0]])
-        m, p0 = measure.kind.num_measures, measure.vectors(y0)
+        m, p0 = sum(measure.kind.groups), measure.vectors(y0)
         since = p0 if step.dt else history[:, m:].reshape(p0.shape)
         scale = min(step.mean_scale(side.body) for side in measure.sides)
-        return DirectedElements(
+        return self._of(
             name=joint.name, sides=measure.sides, measure=measure, law=joint.law, step=step, y0=y0,
             since=since, before=history[:, :m], scale=np.full(len(y0), scale),
         )  # fmt: skip
@@ -268,10 +299,15 @@ class DirectedFriction(OfTwo):
 
     def start(self) -> FloatArray:
         """No force."""
-        p = self.measure.vectors(self.measure.reference())
-        none = np.zeros((len(p), self.measure.kind.num_measures))
-        return np.concatenate([none, p.reshape(len(p), 3 * p.shape[1])], axis=1)
+        return at_start(self.measure)
 
     def coupling(self, bodies: tuple[int, ...]) -> DirectedCoupling:
         """What makes its elements in a run, and remembers its forces."""
         return DirectedCoupling(bodies, self)
+
+
+def at_start(measure: Measure) -> FloatArray:
+    """What `DirectedElements` remember before the first step."""
+    p = measure.vectors(measure.reference())
+    none = np.zeros((len(p), sum(measure.kind.groups)))
+    return np.concatenate([none, p.reshape(len(p), 3 * p.shape[1])], axis=1)

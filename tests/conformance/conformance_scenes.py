@@ -401,10 +401,22 @@ def laws_in_joints(frame):
     return nts.System([*arms, *weights], joints=[*joints, cable], gravity=_gravity(frame))
 
 
+def tipping(frame):
+    """A rigid brick tips over its edge and spins, against friction of all three kinds."""
+    spin = np.array([0.0, -2.0, 3.0])
+    brick = _rigid(
+        frame, (0, -0.3, 0), (0.8, 0.3, 0.5), "brick", spin, np.cross(spin, (0.4, 0, 0.25)),
+        cells=(1, 2, 1),
+    )  # fmt: skip
+    pair = nts.ContactPair(_face(frame, brick, 2, 0.0), _plane(frame), friction=0.2)
+    law = nts.RollingFriction(pair, rolling=frame.size(0.03, 1), spinning=frame.size(0.02, 1))
+    return nts.System([brick], contacts=[pair], joints=[law], gravity=_gravity(frame))
+
+
 #: Step [s] of each scene.
 SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
     beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
     fold: 2e-3, hoist: 5e-3, of_degree_two: 2e-3, beam_on_a_plate: 1e-3, over_waves: 2e-3,
-    laws_in_joints: 1e-2, leaf_on_a_pad: 2e-3,
+    laws_in_joints: 1e-2, leaf_on_a_pad: 2e-3, tipping: 5e-3,
 }  # fmt: skip
