@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 from dolfinx_nts import mpi_first  # noqa: F401 - before anything of DOLFINx
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Traction
+from dolfinx_nts.bodies.conditions import Dirichlet, Pressure, Traction
 from dolfinx_nts.bodies.meshes.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.meshes.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
@@ -17,7 +17,6 @@ from dolfinx_nts.bodies.slender.node_conditions import (
     PointForce,
     PointMoment,
 )
-from dolfinx_nts.bodies.slender.pressure import Pressure
 from dolfinx_nts.bodies.slender.section import Circle, Rectangle, Section
 from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.bodies.solid.continuum import Continuum

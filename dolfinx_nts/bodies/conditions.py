@@ -23,9 +23,11 @@ from dolfinx_nts.types import FloatArray, IntArray, Marker
 from dolfinx_nts.validation import (
     UserFunctionError,
     at_points,
+    is_finite,
     is_whole,
     items,
     known_options,
+    require_bool,
     vector,
     vector_in_time,
 )
@@ -111,9 +113,49 @@ class Traction:
         _check_value("Traction.value", self.value, "Pa", "a function of time that returns them")
 
 
+@known_options
+@dataclass(frozen=True)
+class Pressure:
+    """Pressure on the boundary of a continuum, or on cells of a shell.
+
+    It pushes a continuum inwards, and a shell's middle surface from the bottom to the top. One that
+    follows acts along the normal and on the area of the time. On a continuum it is taken at the
+    place where the integrator takes its forces, in the middle of the step or, in equilibrium, at
+    its end; the resultant and the moment of a uniform one all around are none, and its work is p
+    times the change of the volume but for a third-order term. On a shell its force in a step of
+    `EnergyMomentum` is the mean on the way of the step, so that the work of a constant one on a
+    closed shell is p times the change of the volume exactly; its moment on a closed shell, none, is
+    then off by a third-order term, with `Midpoint` it is exact.
+
+    Attributes:
+        value: [Pa]: a number, or a function of time.
+        where: None: everywhere. Of a continuum facets as of `Traction`; of a shell a function
+            x (3, n) -> bool (n,), and it acts on cells at all whose corners it is true.
+        follower: Whether it follows the body; False: it acts along the normal and on the area of
+            the reference, a dead load.
+
+    Raises:
+        TypeError: follower is no bool, or `where` is meshtags alone.
+        ValueError: value is neither a finite number nor a function.
+    """
+
+    value: float | Callable[[float], float]
+    where: Marker = None
+    follower: bool = True
+
+    def __post_init__(self) -> None:
+        require_bool("follower", self.follower)
+        _check_where("Pressure", self.where)
+        if not callable(self.value) and not is_finite(self.value):
+            raise ValueError(
+                f"Pressure.value={self.value!r}: must be a finite number [Pa], or a function of "
+                "time that returns one"
+            )
+
+
 def _check_where(name: str, where: Marker) -> None:
     """Raise if it is meshtags without a tag, as a pair with a star leaves them."""
-    if hasattr(where, "find"):
+    if hasattr(where, "find") and not isinstance(where, str):
         raise TypeError(
             f"{name}.where={where!r}: is meshtags alone; pass the pair of meshtags and tag, "
             f"without a star, e.g. {name}(part.where('bottom'), ...)"

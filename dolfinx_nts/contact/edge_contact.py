@@ -15,7 +15,7 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_measure import Batch
-from dolfinx_nts.contact.edges import SHARES, Edges, within
+from dolfinx_nts.contact.edges import SHARES, Edges, Pairs, within
 from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross
@@ -173,6 +173,22 @@ class EdgeContact:
         if len(history.pair):
             np.add.at(force, self.ends[0][history.pair[:, 0]], 0.5 * history.force[:, None])
         return global_sum(self.pair.slave.body.comm, force)
+
+    def meets(self, u: Sequence[FloatArray], rise: float, at: BoolArray) -> bool:
+        """Whether an edge from one of these points of the slave meets one of the master's.
+
+        Collective.
+
+        Args:
+            u: Owned displacements of each body [m].
+            rise: The farthest the two are from each other, over the length of the slave's.
+            at: The points, shape (p,).
+        """
+        x, reach = self.positions(u), rise * self.lengths[0]
+        found = self.within(x, float(reach.max(initial=0.0)))
+        near = Pairs(self.edges, found).closest(x, [np.zeros_like(a) for a in x], np.inf)
+        own, close = found[:, 0], np.abs(near.gap[:, 0]) <= reach[found[:, 0]]
+        return bool((near.meet[:, 0] & close & at[self.ends[0][own]].any(axis=1)).any())
 
     def within(self, x: tuple[FloatArray, FloatArray], reach: float) -> IntArray:
         """Its pairs of edges that are nearer than a reach, see `edges.within`.

@@ -19,7 +19,7 @@ _BESIDE = 0.05
 #: The rim touches a facet that it is no farther above or below than this part of the distance from
 #: the node that carries, unless the facet rises from the master by more than the second part, as
 #: that of a ball does.
-_FLAT, _RISES = 0.2, 0.05
+FLAT, _RISES = 0.2, 0.05
 #: It tips to one side: the mean way to the rim is this part of its length, or more.
 _ONE_SIDE = 0.5
 #: Distance from the rim, in widths of the slave's surface, that is told, and that is grave.
@@ -90,7 +90,7 @@ def overhang(
         np.take_along_axis(a, chosen, axis=2)[..., 0]
         for a in (way, height, _rises(corner, on, corners))
     )
-    nearest[~(height <= _FLAT * nearest) | rises] = np.inf
+    nearest[~(height <= FLAT * nearest) | rises] = np.inf
     way = np.take_along_axis(arm, chosen[..., None], axis=2)[:, :, 0]
     # The nearest last, as of several facets of a node it counts.
     order = np.argsort(-nearest[on])

@@ -21,7 +21,7 @@ from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
-from dolfinx_nts.contact.overhang import inside_rim
+from dolfinx_nts.contact.overhang import FLAT, inside_rim
 from dolfinx_nts.contact.self_crossings import SelfPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of, relative_way
@@ -190,10 +190,13 @@ class OverlapWatch:
             if k not in self._edges:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
-            yield from filter(None, (
-                inside_rim(contact, positions, carry, held, borne),
-                in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
-            ))  # fmt: skip
+            rim = inside_rim(contact, positions, carry, held, borne)
+            if rim and k in self._along:
+                # Edges that cross will carry at the rim as soon as the body has tipped so far.
+                where = [u[b] for b in bodies]
+                rim = None if self._along[k].meets(where, FLAT, carry > 0.0) else rim
+            inner = in_inner_edge(self._edges[k], contact, positions, everywhere[k])
+            yield from filter(None, (rim, inner))
 
     def _held_otherwise(self, k: int, forces: _Everywhere) -> BoolArray:
         """Which points of contact k's slave carry in another contact, shape (p,).

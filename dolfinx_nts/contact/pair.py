@@ -20,7 +20,13 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import Asking, global_max
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
-from dolfinx_nts.validation import is_finite, known_options, require_bool, require_one_of
+from dolfinx_nts.validation import (
+    is_finite,
+    known_options,
+    require_bool,
+    require_name,
+    require_one_of,
+)
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5
@@ -132,6 +138,7 @@ class ContactPair:
             slave's nodes, mostly without a word.
         integration: What of the slave is kept out: its "nodes", or the "surface" between them in
             the mean around each node, by points of all facets (theory section 17).
+        name: Name in messages and files. Default: those of slave body and master, as "seal-lid".
 
     Attributes:
         origin: Point of space that positions are relative to [m], shape (3,).
@@ -143,13 +150,14 @@ class ContactPair:
         lift: The largest of them, or 0 [m]; alike on all ranks.
 
     Raises:
-        TypeError: `slave` is no Surface, or `master` of no known kind.
-        ValueError: friction or `adjust` is negative or no number, `interference` or `integration`
-            is unknown, the surfaces share nodes, or
-            "surface" where no body deforms, of a smoothed master, of nodes without mass or with
-            `adjust`.
+        TypeError: `slave` is no Surface, `master` of no known kind, or `name` no text.
+        ValueError: `name` is empty, friction or `adjust` is negative or no number, `interference`
+            or `integration` is unknown, the surfaces share nodes, or "surface" where no body
+            deforms, of a smoothed master, of nodes without mass or with `adjust`.
     """
 
+    #: Name that was given.
+    _label: str | None = None
     #: Whether it keeps nodes out where they are; else what is around them, in the mean.
     holds_nodes: ClassVar[bool] = True
     #: What of the slave is kept out.
@@ -172,8 +180,12 @@ class ContactPair:
     def __init__(
         self, slave: Surface, master: Any, *, friction: Any = 0.0, interference: str = "refuse",
         adjust: float = 0.0, edges: bool = True, integration: str = "nodes",
+        name: str | None = None,
     ) -> None:  # fmt: skip
         rest = _at_rest(friction)
+        if name is not None:
+            require_name("name", name)
+            self._label = name
         require_bool("edges", edges)
         if not (is_finite(adjust) and adjust >= 0.0):
             raise ValueError(f"adjust={adjust!r}: pass a distance >= 0 [m]")
@@ -427,8 +439,8 @@ class ContactPair:
 
     @property
     def name(self) -> str:
-        """Slave body and master, for messages and files."""
-        return f"{self.slave.body.name}-{self.master_name}"
+        """Name for messages and files."""
+        return self._label or f"{self.slave.body.name}-{self.master_name}"
 
     def is_like(self, other: ContactPair) -> bool:
         """Return whether both hold the same nodes, of bodies of equal names, out of one master."""

@@ -52,16 +52,19 @@ class SelfContact(FacetPair):
     Args:
         surface: Of a body that deforms, e.g. `body.surface(lambda x: x[0] < 1)`.
         friction: As of `ContactPair`.
+        name: As of `ContactPair`.
 
     Raises:
         TypeError: `surface` is no Surface.
         ValueError: Its body is rigid, or friction is negative or no number.
     """
 
-    def __init__(self, surface: Surface, *, friction: float = 0.0) -> None:
+    def __init__(
+        self, surface: Surface, *, friction: float = 0.0, name: str | None = None
+    ) -> None:
         if not isinstance(surface, Surface):
             raise TypeError(f"surface={surface!r}: pass a Surface, e.g. body.surface(marker)")
-        super().__init__(surface, surface, friction=friction, edges=False)
+        super().__init__(surface, surface, friction=friction, edges=False, name=name)
 
     def _check_surfaces(self) -> None:
         body = self.slave.body

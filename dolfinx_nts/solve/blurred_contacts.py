@@ -127,9 +127,11 @@ class BlurredContacts:
         largest, least = 0.0, np.inf
         for batch, (last, part) in zip(batches, both, strict=True):
             changes = (last.status != part.status).any(axis=0)
-            press = -part.multiplier[:, 0] / batch.law.yielding
-            for length in (press, part.distance, -part.gap):
-                largest = max(largest, float(length[changes].max(initial=0.0)))
+            # One that just left presses and has slid in the iterate before alone.
+            for each in (last, part):
+                press = -each.multiplier[:, 0] / batch.law.yielding
+                for length in (press, each.distance, -each.gap):
+                    largest = max(largest, float(length[changes].max(initial=0.0)))
             least = min(least, float(batch.law.still.min(initial=np.inf)))
         sizes = global_max(self._problem.system.comm, np.array([largest, -least]))
         self._width, self._last = _FIRST * float(sizes[0]), -float(sizes[1])

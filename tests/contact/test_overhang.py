@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from rotations import random_rotation
-from scenes import at, box
+from scenes import at, box, everywhere
+from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.overhang import overhang
@@ -197,3 +198,23 @@ def test_finer_blocks_and_the_table_as_slave_are_right():
     assert "contact inside a rim" not in exact.warnings
     assert coarse[1] > 3.0 * spin and coarse[0].warnings["contact inside a rim"].grave
     assert fine[1] == pytest.approx(spin, rel=0.02) and fine[0].status == "completed"
+
+
+@pytest.mark.parametrize("edges", [False, True])
+def test_a_cube_that_comes_down_on_a_rim_by_its_vertex(edges):
+    """Its edges cross the rim: they will carry there, unless edges are left out of the contact."""
+    down = Rotation.from_euler("zy", [50, 2], degrees=True).as_matrix()
+    mesh = box([0, 0, 0], [1, 1, 1], [1, 1, 1])
+    mesh.geometry.x[:] = mesh.geometry.x @ down.T
+    lowest = mesh.geometry.x[mesh.geometry.x[:, 2].argmin()]
+    mesh.geometry.x[:] += [0.5, 0.5, 0.0] - lowest
+    table = nts.RigidBody(
+        box([0, -1, -1], [1, 2, 0], [1, 1, 1]), density=1.0, motion=lambda t: (0, 0, 0),
+        rotation=lambda t: (0, 0, 0), name="table",
+    )  # fmt: skip
+    cube = nts.RigidBody(mesh, density=1.0, name="cube")
+    pair = nts.ContactPair(cube.surface(everywhere), table.surface(at(2, 0.0)), edges=edges)
+    system = nts.System([table, cube], contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=2e-2, progress=False)
+    assert (run.contact_forces[:, 0, 2] != 0.0).any()
+    assert ("contact inside a rim" in run.warnings) is not edges

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.conditions import Dirichlet, Pressure
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_values import cell_function, motion_on
@@ -26,7 +26,7 @@ from dolfinx_nts.bodies.slender.director_skin import DirectorSkin
 from dolfinx_nts.bodies.slender.element_values import ElementValues
 from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load, NodeConditions
 from dolfinx_nts.bodies.slender.node_moments import NodeMoments
-from dolfinx_nts.bodies.slender.pressure import Pressure, Pressures
+from dolfinx_nts.bodies.slender.pressure import Pressures
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint

@@ -10,9 +10,14 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, VectorInTime, takes_place
+from dolfinx_nts.bodies.conditions import (
+    Dirichlet,
+    Meetings,
+    Pressure,
+    VectorInTime,
+    takes_place,
+)
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
-from dolfinx_nts.bodies.slender.pressure import Pressure
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Marker, Settings
 from dolfinx_nts.validation import at_points, is_whole, items, known_options, vector_in_time
 

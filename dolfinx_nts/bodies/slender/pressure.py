@@ -1,59 +1,16 @@
-"""Pressure on cells of shells, which follows them or is dead."""
+"""Pressure on cells of shells."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass
 
 from mpi4py import MPI
 
 import numpy as np
 
+from dolfinx_nts.bodies.conditions import Pressure
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.kernels import pressure as kernel
-from dolfinx_nts.types import Array, FloatArray, Marker
-from dolfinx_nts.validation import (
-    at_points,
-    is_finite,
-    known_options,
-    number_at,
-    require_bool,
-)
-
-
-@known_options
-@dataclass(frozen=True)
-class Pressure:
-    """Pressure on a shell, which pushes its middle surface from the bottom to the top.
-
-    A pressure that follows acts along the normal and on the area that a cell has at the time. In a
-    step of `EnergyMomentum` its force is the mean on the way of the step, so that the work of a
-    constant one on a closed shell is p times the change of the volume exactly; its moment on a
-    closed shell, none, is then off by a third-order term, with `Midpoint` it is exact.
-
-    Attributes:
-        value: [Pa]: a number, or a function of time.
-        where: Function x (3, n) -> bool (n,): it acts on cells at all whose corners it is true;
-            None: everywhere.
-        follower: Whether it follows the shell; False: it acts along the normal and on the area of
-            the reference, a dead load.
-
-    Raises:
-        TypeError: follower is no bool.
-        ValueError: value is neither a finite number nor a function.
-    """
-
-    value: float | Callable[[float], float]
-    where: Marker = None
-    follower: bool = True
-
-    def __post_init__(self) -> None:
-        require_bool("follower", self.follower)
-        if not callable(self.value) and not is_finite(self.value):
-            raise ValueError(
-                f"Pressure.value={self.value!r}: must be a finite number [Pa], or a function of "
-                "time that returns one"
-            )
+from dolfinx_nts.types import Array, FloatArray
+from dolfinx_nts.validation import at_points, number_at
 
 
 class Pressures:

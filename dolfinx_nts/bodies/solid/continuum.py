@@ -14,7 +14,7 @@ from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
+from dolfinx_nts.bodies.conditions import Dirichlet, Pressure, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.arguments import check_cells, check_material
 from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
@@ -35,6 +35,7 @@ from dolfinx_nts.validation import (
     is_whole,
     items,
     known_options,
+    number_at,
     require_name,
     vector_in_time,
 )
@@ -75,7 +76,7 @@ class Continuum(UflBody):
             are wrong by tens of per cent with 1; else that of the mesh. Cells of a mesh of degree 2
             are curved.
         body_force: Force per reference volume [N/m^3], a vector or a function of time.
-        traction: `Traction` loads.
+        traction: `Traction` and `Pressure` loads.
         quadrature_degree: For energy, stress and loads; default 2 x 2 x 2 Gauss points on trilinear
             hexahedra. Mass has never less than that: with one point a cell could turn without
             inertia.
@@ -127,7 +128,7 @@ class Continuum(UflBody):
         name: str = "body",
         degree: int | None = None,
         body_force: VectorInTime = (0.0, 0.0, 0.0),
-        traction: Sequence[Traction] = (),
+        traction: Sequence[Traction | Pressure] = (),
         quadrature_degree: int | None = None,
         extra_form: ExtraForm | None = None,
         allow_inversion: bool = False,
@@ -140,7 +141,11 @@ class Continuum(UflBody):
             if value is not None and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
-        traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
+        traction = items(
+            "traction", traction, lambda t: isinstance(t, Traction | Pressure),
+            "Traction or Pressure",
+        )  # fmt: skip
+        follows = any(isinstance(load, Pressure) and load.follower for load in traction)
         least = check_mesh(mesh, name)
         degree = degree or (2 if compat.cell_name(mesh) == "tetrahedron" else least)
         viscous = is_viscous(viscosity)
@@ -149,6 +154,7 @@ class Continuum(UflBody):
         super().__init__(
             compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
             allow_inversion, self._viscous if viscous else None,
+            self._following if follows else None,
         )  # fmt: skip
         self.material, self.density, self.viscosity = material, density, viscosity
         self.losses = ("viscous_dissipation",) if viscous else ()
@@ -160,7 +166,7 @@ class Continuum(UflBody):
         self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
         self._ds = self._boundary_measure(quadrature_degree)
         changing = any(callable(value) for value, _ in self._loads_at(0.0))
-        self.loads_in_time = changing or extra_form is not None
+        self.loads_in_time = changing or extra_form is not None or follows
         self._stand(bcs, velocity, displacement)
         self._rho, self._eta = self._density(density), self._on_mesh("viscosity", viscosity)
         self.law = strain_energy(with_constants(material, self.mesh))
@@ -175,17 +181,21 @@ class Continuum(UflBody):
         (self._load_form,) = self._set_forms(
             energy * self._dx, load, means=means, others=[self._eta]
         )
-        self._assembled_loads = np.zeros(3 * len(self._loads))
+        self._assembled_loads = np.zeros(sum(constant.value.size for constant in self._loads))
         self._seen_at_rest = False
         self._jumps: tuple[StressJumps, CellMeans | None] | None = None
         self.stressed = None
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:
-        indices = [
-            facets_of(self.mesh, load.where, f"Traction.where of traction[{k}] of {self.name!r}")
-            for k, load in enumerate(self._traction)
-        ]
+        indices = []
+        for k, load in enumerate(self._traction):
+            what = f"{type(load).__name__}.where of traction[{k}] of {self.name!r}"
+            everywhere = load.where is None and isinstance(load, Pressure)
+            indices.append(
+                compat.exterior_facets(self.mesh) if everywhere
+                else facets_of(self.mesh, load.where, what)
+            )  # fmt: skip
         tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
         empty = np.empty(0, np.int32)
         index, tag = (
@@ -195,7 +205,7 @@ class Continuum(UflBody):
         shared = len(index) - len(np.unique(index))
         text = (
             f"traction of {self.name!r}: {shared} facets carry two loads; add their values up in "
-            "one Traction"
+            "one of them"
         )
         raise_together(self.comm, text if shared else None)
         order = np.argsort(index)
@@ -205,13 +215,29 @@ class Continuum(UflBody):
         )
 
     def _load_in_ufl(self) -> Any:
-        """Virtual work of body force and tractions, whose values are Constants."""
-        w, count = ufl.TestFunction(self.space), 1 + len(self._traction)
-        self._loads = [fem.Constant(self.mesh, np.zeros(3)) for _ in range(count)]
+        """Virtual work of all loads but those that follow; their values are Constants."""
+        w, n = ufl.TestFunction(self.space), ufl.FacetNormal(self.mesh)
+        self._loads = [
+            fem.Constant(self.mesh, np.zeros(() if isinstance(load, Pressure) else 3))
+            for load in (None, *self._traction)
+        ]
         load = ufl.inner(self._loads[0], w) * self._dx
-        for k, value in enumerate(self._loads[1:]):
-            load += ufl.inner(value, w) * self._ds(k)
+        for k, (given, value) in enumerate(zip(self._traction, self._loads[1:], strict=True)):
+            if not isinstance(given, Pressure):
+                load += ufl.inner(value, w) * self._ds(k)
+            elif not given.follower:
+                load -= value * ufl.inner(n, w) * self._ds(k)
         return load
+
+    def _following(self, u: Any, v: Any, w: Any, t: Any) -> Any:
+        """Virtual work of the pressures that follow, as of `extra_form`."""
+        f = ufl.Identity(3) + ufl.grad(u)
+        area = ufl.dot(ufl.det(f) * ufl.inv(f).T, ufl.FacetNormal(self.mesh))
+        return sum(
+            value * ufl.inner(area, w) * self._ds(k)
+            for k, (load, value) in enumerate(zip(self._traction, self._loads[1:], strict=True))
+            if isinstance(load, Pressure) and load.follower
+        )
 
     def energy(self) -> tuple[Any, CellMeans | None]:
         """W as a function of Green's strain in UFL that forces are made of, and means it makes."""
@@ -392,8 +418,8 @@ class Continuum(UflBody):
             self._seek_stress_at_rest(rule)
         super().begin_step(rule, moment)
         for constant, (value, now) in zip(self._loads, self._loads_at(moment.time), strict=True):
-            constant.value[:] = now if callable(value) else moment.ramp * now
-        loads = np.concatenate([constant.value for constant in self._loads])
+            constant.value[...] = now if callable(value) else moment.ramp * now
+        loads = np.concatenate([constant.value.ravel() for constant in self._loads])
         if not np.array_equal(loads, self._assembled_loads):
             self._load, self._assembled_loads = self._forms.assemble(self._load_form), loads
 
@@ -414,12 +440,18 @@ class Continuum(UflBody):
         if not stress <= _STRESS_FREE * stiffness:
             self.stressed = stress / stiffness if stiffness else math.inf
 
-    def _loads_at(self, time: float) -> list[tuple[VectorInTime, FloatArray]]:
-        """Body force and tractions as they were given, and their values at a time."""
-        given = [("body_force", self.body_force, "N/m^3")]
-        for k, traction in enumerate(self._traction):
-            given.append((f"Traction.value of traction[{k}]", traction.value, "Pa"))
-        return [
-            (value, vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit))
-            for name, value, unit in given
-        ]
+    def _loads_at(self, time: float) -> list[tuple[Any, Any]]:
+        """Body force, tractions and pressures as they were given, and their values at a time."""
+        what = f"body_force of {self.name!r}"
+        now: Any = vector_in_time(self.comm, what, self.body_force, time, "N/m^3")
+        found = [(self.body_force, now)]
+        for k, load in enumerate(self._traction):
+            what = f"{type(load).__name__}.value of traction[{k}] of {self.name!r}"
+            if not isinstance(load, Pressure):
+                now = vector_in_time(self.comm, what, load.value, time, "Pa")
+            elif callable(load.value):
+                now = number_at(self.comm, what, load.value, time, "Pa")
+            else:
+                now = load.value
+            found.append((load.value, now))
+        return found

@@ -56,6 +56,7 @@ class UflBody(MeshBody):
         quadrature_degree: That of the energy; cells of 3D meshes are watched at its points.
         allow_inversion: As of `Continuum`.
         viscous: Virtual work of a viscosity, as of `StepForms`.
+        following: That of loads that follow the body, as `extra_form`.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -69,6 +70,7 @@ class UflBody(MeshBody):
     def __init__(
         self, space: fem.FunctionSpace, degree: int, name: str, extra_form: ExtraForm | None,
         quadrature_degree: int, allow_inversion: bool, viscous: Any = None,
+        following: ExtraForm | None = None,
     ) -> None:  # fmt: skip
         require_name("name", name)
         require_bool("allow_inversion", allow_inversion)
@@ -89,9 +91,12 @@ class UflBody(MeshBody):
         self._determinants: Determinants | None = None
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
+        extra = [form for form in (extra_form, following) if form is not None]
         self._forms = StepForms(
-            space, self._virtual_work, self._mass_form, extra_form, viscous, self.check_alive
-        )
+            space, self._virtual_work, self._mass_form,
+            (lambda *given: sum(form(*given) for form in extra)) if extra else None,
+            viscous, self.check_alive,
+        )  # fmt: skip
 
     # ---- what a kind of body has of its own
     def _mass_form(self, v: Any, w: Any) -> Any:
