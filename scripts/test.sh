@@ -1,9 +1,9 @@
 #!/bin/bash
-# The tests: pytest in serial (a process on each core, a test file at a time), then the tests marked
+# The tests: pytest in serial (a process on each core, a test file at a time), and the tests marked
 # mpi on 2 ranks.
 #   test.sh          the fast tests, and lint beside the serial ones
-#   test.sh --slow   the tests marked slow, which the fast ones leave out; those that start 3 or 4
-#                    ranks of their own come last and one by one, as waiting ranks take a core each
+#   test.sh --slow   the tests marked slow, which the fast ones leave out, those on ranks first; those
+#                    that start 3 or 4 ranks of their own one by one, as waiting ranks take a core each
 # A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest ("-n0 --pdb ..." for
 # those that need its terminal, with one process); NO_LINT=1 skips lint.
 set -uo pipefail
@@ -33,28 +33,36 @@ finished() {
   fi
 }
 
-stage="$name tests, serial"
-say "$stage"
-"$PYTHON" -m pytest -q -n auto --dist loadfile -m "$which and not on_ranks" "${args[@]}" </dev/null
-finished "$stage" $?
+in_serial() {
+  local stage="$name tests, serial"
+  say "$stage"
+  "$PYTHON" -m pytest -q -n auto --dist loadfile -m "$which and not on_ranks" "${args[@]}" </dev/null
+  finished "$stage" $?
+}
 
-if [ -z "${NO_LINT:-}" ]; then
-  wait $! || failed+=(lint)
-  cat "$said"
-fi
-
-stage="$name tests marked mpi, 2 ranks"
-say "$stage"
-color=no # mpirun gives every rank a terminal, so pytest cannot tell
-[ ! -t 1 ] || color=yes
-mpi 2 "$PYTHON" -m pytest -q -m "mpi and $which" -p no:cacheprovider --color="$color" "${args[@]}"
-finished "$stage" $?
+on_two_ranks() {
+  local stage="$name tests marked mpi, 2 ranks" color=no
+  say "$stage"
+  [ ! -t 1 ] || color=yes # mpirun gives every rank a terminal, so pytest cannot tell
+  mpi 2 "$PYTHON" -m pytest -q -m "mpi and $which" -p no:cacheprovider --color="$color" "${args[@]}"
+  finished "$stage" $?
+}
 
 if [ "$which" = slow ]; then
+  # Those in serial take longest: where time is up (--until), some of them are left out.
+  on_two_ranks
   stage="tests on 3 and 4 ranks"
   say "$stage"
   "$PYTHON" -m pytest -q -m on_ranks "${args[@]}" </dev/null
   finished "$stage" $?
+  in_serial
+else
+  in_serial
+  if [ -z "${NO_LINT:-}" ]; then
+    wait $! || failed+=(lint)
+    cat "$said"
+  fi
+  on_two_ranks
 fi
 
 if [ ${#failed[@]} != 0 ]; then

@@ -21,7 +21,7 @@ from dolfinx_nts.interaction.kinematics import Kinematics
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.joints.between import OfTwo
-from dolfinx_nts.joints.laws import Bound, JointFriction
+from dolfinx_nts.joints.laws import TIE, Bound, JointFriction
 from dolfinx_nts.parallel import Asking
 from dolfinx_nts.state import State
 from dolfinx_nts.types import BoolArray, FloatArray
@@ -168,7 +168,7 @@ class DirectedElements(PointElements):
         of = np.repeat(np.arange(len(measure.kind.groups)), measure.kind.groups)
         alike = (of[:, None] == of).astype(float)
         reach = np.sqrt(np.square(trial) @ alike)
-        stick = np.broadcast_to(reach <= most, (n, m))
+        stick = np.broadcast_to(reach <= (1.0 + TIE) * most, (n, m))
         way = trial / np.maximum(reach, TINY)
         # How the bound's force turns with the trial.
         turns = np.where(stick, 0.0, most / np.maximum(reach, TINY))[:, :, None] * (

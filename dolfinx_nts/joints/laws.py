@@ -29,6 +29,9 @@ Motor = Callable[[float, float, float], float]
 
 #: Angle [rad] of a cone, the least: its cosine hardly knows smaller ones.
 _NARROW = 5e-3
+#: A force may exceed its bound by this part and stick: rounding must not decide where they are
+#: equal, as at the end of a load step that just reaches the bound.
+TIE = 1e-9
 #: Part of a measure or a rate by which a motor is asked for its slopes.
 _APART = float(np.finfo(float).eps) ** (1 / 3)
 
@@ -120,7 +123,7 @@ class Bound(NamedTuple):
         """Stick c_1 = c_0, or D = bound sign(c_1 - c_0), by the trial D + c_1 - c_0."""
         slip, most = end - start, self.bound / unit
         trial = slip if self.held is not None else force + slip
-        stick = np.abs(trial) <= most if self.held is None else self.held
+        stick = np.abs(trial) <= (1.0 + TIE) * most if self.held is None else self.held
         if self.width:
             # D times the root is bound times the slip: linear in D, which counts as within its
             # bound in the slope.

@@ -78,7 +78,11 @@ def test_friction_where_walls_hold_the_same_nodes(integration):
     exact = mu * (stretch - 1.0 / stretch) + lame * np.log(stretch) / stretch
     assert run.status == "completed"
     assert run.contact_forces[-1, 4:, 2] == pytest.approx((-exact, exact), rel=1e-9)
-    assert np.abs(run.contact_forces[-1, 4:, :2]).max() < 1e-6 * abs(exact)
+    # How friction and the walls divide what holds the edges is not unique, their sum is.
+    assert np.abs(run.contact_forces[-1].sum(axis=0)).max() < 1e-9 * abs(exact)
+    place = body.reference.reshape(-1, 3)
+    moved = body.u.x.array[: body.num_owned].reshape(-1, 3)
+    assert moved == pytest.approx(place * [0, 0, stretch - 1.0], abs=1e-9)
 
 
 def test_a_block_that_slides_and_bounces_keeps_the_ledger():

@@ -89,8 +89,12 @@ def test_friction_stops_a_disc(rule, unit):
 
 
 @pytest.mark.parametrize("stabilization", [None, 1.0])
-def test_a_clutch_slips_at_rest(stabilization):
-    """A spring of 2 N m/rad turns by 0.5 rad under a clutch of 1 N m that is driven farther."""
+@pytest.mark.parametrize("off", [0.0, 3e-15, 7e-15])
+def test_a_clutch_slips_at_rest(stabilization, off):
+    """A spring of 2 N m/rad turns by 0.5 rad under a clutch of 1 N m that is driven farther.
+
+    The second load step ends just where it begins to slip, whatever rounding says.
+    """
     inertia = (0.1, 0.1, INERTIA)
     crank, turned = (nts.RigidBody.from_inertia(1.0, inertia, name=n) for n in ("crank", "turned"))
     about = {"point": (0, 0, 0), "axis": (0, 0, 1)}
@@ -99,11 +103,11 @@ def test_a_clutch_slips_at_rest(stabilization):
         nts.Revolute(
             turned, crank, friction=nts.JointFriction(bound=1.0), name="clutch", **about
         ),
-        nts.TorsionSpring(turned, None, axis=(0, 0, 1), stiffness=2.0, name="spring"),
+        nts.TorsionSpring(turned, None, axis=(0, 0, 1), stiffness=2.0 + off, name="spring"),
     ]
     system = nts.System([crank, turned], joints=joints)
     run = nts.equilibrium(system, load_steps=[0.25, 0.5, 0.75, 1.0], stabilization=stabilization)
-    assert run.status == "completed"
+    assert run.status == "completed" and not run.retries
     assert np.arctan2(turned.rotation[1, 0], turned.rotation[0, 0]) == pytest.approx(0.5)
     lost = run.balance["friction_dissipation"]
     assert lost == pytest.approx([0, 0, 0, 0.25, 0.5], abs=1e-9)

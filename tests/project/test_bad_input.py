@@ -358,7 +358,7 @@ def test_tractions_overlap_on_one_rank():
         return top(x) & (x[0] < 0.5 + 1e-9) & (x[1] < 0.5 + 1e-9)
 
     loads = [nts.Traction(top, (1, 0, 0)), nts.Traction(corner, (0, 1, 0))]
-    pattern = r"^traction of 'body': 1 facets carry two loads; add their values up in one Traction"
+    pattern = r"^traction of 'body': 1 facets carry two loads; add their values up in one of them"
     raises(ValueError, pattern, lambda: continuum(traction=loads))
 
 
