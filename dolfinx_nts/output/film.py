@@ -32,7 +32,7 @@ class _Frame(NamedTuple):
     """What is seen at a time, on rank 0.
 
     Attributes:
-        title: Its time, or the part of the loads.
+        title: Its time, or pseudo time.
         seen: Bodies, obstacles and joints.
         places: Of nodes with contact forces [m], shape (n, 3).
         forces: There [N], shape (n, 3).
@@ -65,8 +65,10 @@ class Film:
         limits: Ends of the colour scale; None: those of the film.
         width: Of what is drawn [inch], 80 dots per inch.
         units: As of `pictures.picture`.
+        hide: As of `pictures.picture`; what is hidden has no arrows either.
 
     Raises:
+        TypeError: From `start`: an item of `hide` is none.
         ValueError: An argument is out of range; from `start`: no body has a mesh, or the colour.
         OSError: On all ranks, as the run ends: the file cannot be written.
     """
@@ -83,6 +85,7 @@ class Film:
         limits: tuple[float, float] | None = None,
         width: float = 5.0,
         units: str = "m",
+        hide: Sequence[Any] = (),
     ) -> None:
         self.path = as_path("path", path)
         if self.path.suffix.lower() != ".gif":
@@ -91,11 +94,12 @@ class Film:
         require_bool("forces", forces)
         self.forces = forces
         self._look: tuple[Any, ...] = (colour, view, limits, width, units)
+        self._hide = hide
         self._frames: list[_Frame] = []
 
     def start(self, stepper: Running) -> None:
         """Take the initial state."""
-        check_look(Given.of("system", stepper), *self._look)
+        check_look(Given.of("system", stepper, self._hide), *self._look)
         self._frames = []
         self._cadence.start(stepper)
         self._take(stepper)
@@ -114,17 +118,17 @@ class Film:
 
     def _take(self, stepper: Running) -> None:
         """Keep what is seen now. Collective."""
-        given = Given.of("system", stepper)
+        given = Given.of("system", stepper, self._hide)
         now = seen(given, self._look[0])
         found = [(np.empty((0, 3)), np.empty((0, 3)))]
-        for body in given.bodies if self.forces else ():
+        for body in given.shown if self.forces else ():
             found += _loads(stepper, body)
         places, forces = (
             gather_on_root(stepper.system.comm, np.concatenate(a))
             for a in zip(*found, strict=True)
         )
         time = f"{stepper.state.time:.4g}"
-        title = f"t = {time} s" if stepper.solution.moving else f"{time} of the loads"
+        title = f"t = {time} s" if stepper.solution.moving else f"pseudo time {time}"
         self._frames.append(_Frame(title, now, places, forces))
 
     def _draw(self) -> None:
