@@ -59,7 +59,8 @@ def picture(
         view: Elevation above the x-y plane and azimuth from the x axis, of the viewer [degrees].
         limits: Ends of the colour scale, e.g. equal ones for all pictures of a run; None: the
             percentiles 2 and 98 of values that are not zero, and zero where it occurs, symmetric
-            where there are values of both signs; of "pressure" zero and the largest. The colour bar has a tip where values lie beyond.
+            where there are values of both signs; of "pressure" zero and the largest. The colour
+            bar has a tip where values lie beyond.
         width: Of what is drawn on paper [inch]; 200 dots per inch.
         units: Of lengths in the scene: "m", or "mm" with stresses in MPa.
         hide: Bodies and obstacles of a run or a `System` that are left out, themselves or their
