@@ -7,8 +7,10 @@ import io
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import basix
 import numpy as np
 
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.output.colours import Colour
 from dolfinx_nts.output.painting import Look, Painter
@@ -24,6 +26,8 @@ from dolfinx_nts.validation import StrPath, as_path, require_bool
 #: largest are left out.
 _LONGEST, _LEAST = 0.2, 0.02
 _COLOUR = "crimson"
+#: Weight of a vertex that is none but for rounding.
+_NONE = 1e-12
 #: Dots per inch, and frames per second.
 _DOTS, _PACE = 80, 15.0
 
@@ -32,9 +36,9 @@ class _Frame(NamedTuple):
     """What is seen at a time, on rank 0.
 
     Attributes:
-        title: Its time, or the part of the loads.
+        title: Its time, or pseudo time.
         seen: Bodies, obstacles and joints.
-        places: Of nodes with contact forces [m], shape (n, 3).
+        places: Of vertices with contact forces [m], shape (n, 3).
         forces: There [N], shape (n, 3).
     """
 
@@ -48,10 +52,11 @@ class Film:
     """Writes a GIF of a run, all frames of one size and one scale of colours.
 
     What is in a frame is that of `pictures.picture` of a run; "pressure" is the mean of two steps.
-    Arrows are contact forces on the nodes of slaves and masters, the longest that of the largest
-    force in the film. In dynamics with a consistent mass the forces of single steps alternate. The
-    frames are kept on rank 0, 32 bytes for each corner of a facet, and drawn when the run ends, a
-    second each; where it fails, the film ends there. A run that goes on from a checkpoint makes a
+    Arrows are contact forces on the vertices of slaves and masters, which share those of the nodes
+    between them, the longest that of the largest force in the film. In dynamics with a consistent
+    mass the forces of single steps alternate. The frames are kept on rank 0, 32 bytes for each
+    corner of a facet, and drawn when the run ends, a second each; where it fails, the film ends
+    there. A run that goes on from a checkpoint makes a
     film of what follows alone, so give it a path of its own.
 
     Args:
@@ -65,8 +70,10 @@ class Film:
         limits: Ends of the colour scale; None: those of the film.
         width: Of what is drawn [inch], 80 dots per inch.
         units: As of `pictures.picture`.
+        hide: As of `pictures.picture`; what is hidden has no arrows either.
 
     Raises:
+        TypeError: From `start`: an item of `hide` is none.
         ValueError: An argument is out of range; from `start`: no body has a mesh, or the colour.
         OSError: On all ranks, as the run ends: the file cannot be written.
     """
@@ -83,6 +90,7 @@ class Film:
         limits: tuple[float, float] | None = None,
         width: float = 5.0,
         units: str = "m",
+        hide: Sequence[Any] = (),
     ) -> None:
         self.path = as_path("path", path)
         if self.path.suffix.lower() != ".gif":
@@ -91,11 +99,12 @@ class Film:
         require_bool("forces", forces)
         self.forces = forces
         self._look: tuple[Any, ...] = (colour, view, limits, width, units)
+        self._hide = hide
         self._frames: list[_Frame] = []
 
     def start(self, stepper: Running) -> None:
         """Take the initial state."""
-        check_look(Given.of("system", stepper), *self._look)
+        check_look(Given.of("system", stepper, self._hide), *self._look)
         self._frames = []
         self._cadence.start(stepper)
         self._take(stepper)
@@ -114,17 +123,20 @@ class Film:
 
     def _take(self, stepper: Running) -> None:
         """Keep what is seen now. Collective."""
-        given = Given.of("system", stepper)
+        given = Given.of("system", stepper, self._hide)
         now = seen(given, self._look[0])
-        found = [(np.empty((0, 3)), np.empty((0, 3)))]
-        for body in given.bodies if self.forces else ():
-            found += _loads(stepper, body)
-        places, forces = (
+        found = [(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))]
+        for k, body in enumerate(given.shown if self.forces else ()):
+            found += _loads(stepper, body, k)
+        places, shares, names = (
             gather_on_root(stepper.system.comm, np.concatenate(a))
             for a in zip(*found, strict=True)
         )
+        _, first, of = np.unique(names, axis=0, return_index=True, return_inverse=True)
+        places, forces = places[first], np.zeros((len(first), 3))
+        np.add.at(forces, np.ravel(of), shares)
         time = f"{stepper.state.time:.4g}"
-        title = f"t = {time} s" if stepper.solution.moving else f"{time} of the loads"
+        title = f"t = {time} s" if stepper.solution.moving else f"pseudo time {time}"
         self._frames.append(_Frame(title, now, places, forces))
 
     def _draw(self) -> None:
@@ -156,17 +168,48 @@ class Film:
         replace_file(self.path, file.getvalue())
 
 
-def _loads(stepper: Running, body: Any) -> Sequence[tuple[FloatArray, FloatArray]]:
-    """Places [m] and contact forces [N] of this rank's nodes, (n, 3) each. Collective."""
+def _loads(
+    stepper: Running, body: Any, k: int
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """What this rank's nodes give the vertices of their cells of contact forces. Collective.
+
+    Nodes of degree 2 between vertices carry most of a pressure, or all of it; each hands its force
+    to those around it as a linear function does, which keeps sums and moments.
+
+    Args:
+        stepper: The run.
+        body: One of its bodies.
+        k: Its number.
+
+    Returns:
+        Of each contact places [m], forces [N], and what tells the vertices apart, (n, 3) each.
+    """
     if body.degree is None:
         return []
     loads = stepper.solution.contact_loads
     fields = contact_fields.at_nodes(stepper.system, stepper.state, loads, body)
-    owned = body.space.dofmap.index_map.size_local
-    x = body.space.tabulate_dof_coordinates()[:owned]
-    x = x + body.u.x.array[: 3 * owned].reshape(-1, 3)
-    found = [values for name, values in fields.items() if name.startswith("contact_load_")]
-    return [(x[load.any(axis=1)], load[load.any(axis=1)]) for load in found]
+    x = body.space.tabulate_dof_coordinates() + body.u.x.array.reshape(-1, 3)
+    index_map, cells = body.space.dofmap.index_map, compat.cell_dofs(body.space)
+    kind = getattr(basix.CellType, compat.cell_name(body.mesh))
+    variant = basix.LagrangeVariant.gll_warped
+    nodal, linear = (
+        basix.create_element(basix.ElementFamily.P, kind, d, variant) for d in (body.degree, 1)
+    )
+    weights = linear.tabulate(0, nodal.points)[0, :, :, 0]
+    last = np.zeros(len(x), dtype=np.int64)  # cell and place in it of each node
+    last[cells.ravel()] = np.arange(cells.size)
+    found = []
+    names = [name for name in fields if name.startswith("contact_load_")]
+    for number, load in enumerate(fields[name] for name in names):
+        there = np.flatnonzero(load.any(axis=1))
+        cell, own = np.divmod(last[there], cells.shape[1])
+        vertices = cells[cell, : linear.dim]
+        shares = weights[own][..., None] * load[there, None]
+        some = weights[own] > _NONE
+        ids = index_map.local_to_global(vertices[some].astype(np.int32))
+        known = np.column_stack([np.full(len(ids), k), np.full(len(ids), number), ids])
+        found.append((x[vertices[some]], shares[some], known.astype(float)))
+    return found
 
 
 def _arrows(axes: Any, places: FloatArray, ways: FloatArray, least: float) -> None:

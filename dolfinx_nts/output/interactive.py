@@ -5,6 +5,7 @@ pyvista is no need of the package: `pip install "dolfinx_nts[view]"`, or pyvista
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ def view(
     colour: Colour = "speed",
     limits: tuple[float, float] | None = None,
     units: str = "m",
+    hide: Sequence[Any] = (),
 ) -> Any:
     """A scene as it stands, to be turned and zoomed; every rank calls it.
 
@@ -40,8 +42,9 @@ def view(
     Args:
         scene: A `System`, what `simulate` or `equilibrium` return, a `Stepper`, or bodies.
         colour: What bodies are coloured by.
-        limits: Ends of the colour scale; None: percentiles.
+        limits: Ends of the colour scale; None: as of `picture`.
         units: Of lengths in the scene: "m", or "mm" with stresses in MPa.
+        hide: Bodies and obstacles that are left out.
 
     Returns:
         pyvista's Plotter on rank 0, with an actor of the name of each body, and "obstacles",
@@ -52,7 +55,7 @@ def view(
         TypeError: As of `picture`.
         ValueError: As of `picture`.
     """
-    given = Given.of("scene", scene)
+    given = Given.of("scene", scene, hide)
     check_look(given, colour, (0.0, 0.0), limits, 1.0, units)
     now = seen(given, colour)
     return on_root(given.comm, lambda: _plotter(now, colour, limits, units))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ def picture(
     limits: tuple[float, float] | None = None,
     width: float = 7.0,
     units: str = "m",
+    hide: Sequence[Any] = (),
 ) -> None:
     """Draw a scene as it stands; every rank calls it, rank 0 writes.
 
@@ -57,16 +59,19 @@ def picture(
         view: Elevation above the x-y plane and azimuth from the x axis, of the viewer [degrees].
         limits: Ends of the colour scale, e.g. equal ones for all pictures of a run; None: the
             percentiles 2 and 98 of values that are not zero, and zero where it occurs, symmetric
-            where there are values of both signs. The colour bar has a tip where values lie beyond.
+            where there are values of both signs; of "pressure" zero and the largest. The colour
+            bar has a tip where values lie beyond.
         width: Of what is drawn on paper [inch]; 200 dots per inch.
         units: Of lengths in the scene: "m", or "mm" with stresses in MPa.
+        hide: Bodies and obstacles of a run or a `System` that are left out, themselves or their
+            names, such as a housing around a seal.
 
     Raises:
-        TypeError: The scene is none, or has an item without a mesh.
+        TypeError: The scene is none, or has an item without a mesh; an item of `hide` is none.
         ValueError: Unknown colour, or one that no body has, no body, or an argument out of range.
         OSError: On all ranks: the file cannot be written.
     """
-    given = Given.of("scene", scene)
+    given = Given.of("scene", scene, hide)
     check_look(given, colour, view, limits, width, units)
     require_bool("labels", labels)
     file = as_path("path", path)

@@ -34,20 +34,22 @@ class Given(NamedTuple):
         system: Whose obstacles and joints are shown, too; None: bodies alone.
         run: What has its contacts' forces; None: a scene alone.
         time: Where obstacles stand [s].
+        hidden: Bodies and obstacles that are left out.
     """
 
     bodies: tuple[Any, ...]
     system: System | None
     run: Any
     time: float
+    hidden: tuple[Any, ...] = ()
 
     @classmethod
-    def of(cls, name: str, scene: Any) -> Given:
-        """A run, a scene, or bodies.
+    def of(cls, name: str, scene: Any, hide: Any = ()) -> Given:
+        """A run, a scene, or bodies, less bodies and obstacles or those of these names.
 
         Raises:
-            TypeError: It is none.
-            ValueError: There is nothing to be seen of its bodies.
+            TypeError: It is none, or an item of `hide`.
+            ValueError: There is nothing to be seen of its bodies, or nothing to hide.
         """
         run = scene if hasattr(scene, "system") and hasattr(scene, "state") else None
         system = scene if run is None else run.system
@@ -62,7 +64,39 @@ class Given(NamedTuple):
                 "joints are drawn, of which it has none"
             )
         time = 0.0 if run is None or run.state is None else run.state.time
-        return cls(bodies, system, run, time)
+        given = cls(bodies, system, run, time)
+        given = given._replace(hidden=given._those("hide", hide))
+        if bodies and not given.shown:
+            raise ValueError(f"hide={hide!r}: leave one of {[b.name for b in bodies]} to be seen")
+        return given
+
+    def _those(self, name: str, wanted: Any) -> tuple[Any, ...]:
+        """Bodies and obstacles by themselves or their names."""
+        there = [*self.bodies, *self.obstacles]
+        each = "bodies and obstacles, or their names"
+        if isinstance(wanted, str):
+            raise TypeError(f"{name}={wanted!r}: pass a sequence of {each}, such as [{wanted!r}]")
+        wanted = items(name, wanted, lambda a: isinstance(a, str | Body | Obstacle), each)
+        for item in wanted:
+            if not any(item is x or item == x.name for x in there):
+                names = [x.name for x in there]
+                raise ValueError(f"{name}: {item!r} is not there; pass some of {names}")
+        return tuple(x for x in there if any(item is x or item == x.name for item in wanted))
+
+    @property
+    def shown(self) -> tuple[Any, ...]:
+        """Bodies that are not hidden."""
+        return tuple(body for body in self.bodies if not self.hides(body))
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """All of the scene, also what is hidden."""
+        masters = [p.master for p in self.system.contacts] if self.system else []
+        return tuple({id(m): m for m in masters if isinstance(m, Obstacle)}.values())
+
+    def hides(self, item: Any) -> bool:
+        """Whether a body or an obstacle is hidden."""
+        return any(item is x for x in self.hidden)
 
     @property
     def comm(self) -> Any:
@@ -118,6 +152,8 @@ def seen(given: Given, colour: Colour) -> Seen:
     """What is to be seen now. Collective."""
     drawn, sketches = [], []
     for k, body in enumerate(given.bodies):
+        if given.hides(body):
+            continue
         if not _has_facets(body):
             sketches.append(Sketch(lines=gather_on_root(body.comm, _edges(body))))
             continue
@@ -132,8 +168,8 @@ def seen(given: Given, colour: Colour) -> Seen:
     for joint in given.system.declared_joints:
         sketch = joint.sketch([body.last_accepted()[0] for body in joint.bodies])
         sketches += [sketch, _sticks(joint, sketch.points)]
-    there = {id(m): m for m in (p.master for p in given.system.contacts) if isinstance(m, Obstacle)}
-    obstacles = [(m, m.displacement(given.time, comm)) for m in there.values()]
+    there = [m for m in given.obstacles if not given.hides(m)]
+    obstacles = [(m, m.displacement(given.time, comm)) for m in there]
     return Seen(drawn, joined(sketches), obstacles)
 
 

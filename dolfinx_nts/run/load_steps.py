@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -18,17 +19,21 @@ from dolfinx_nts.run.solution import Equilibrium
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.trial import solved, state_after
 from dolfinx_nts.solve.convergence import unrest
+from dolfinx_nts.solve.failure import used_up
 from dolfinx_nts.start.free_motion import free_motion
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
+logger = logging.getLogger(__name__)
+
 #: A load step is dropped if a slave ends this part of a facet behind one of which it was no
 #: candidate.
 _MISSED = 0.1
-#: Relaxations of one load step before it counts as without equilibrium.
-_RELAXATIONS = 100
+#: Relaxations of one load step before it counts as without equilibrium, and the fewest of a part of
+#: it: the next attempt has half of those of one that has run out of them.
+_RELAXATIONS, _FEWEST = 100, 25
 #: Below this part of the forces the stabilization no longer moves nodes to other facets.
 _NEARLY_AT_REST = 1e-2
 #: A failed relaxation is repeated with a stiffer stabilization, up to this.
@@ -40,6 +45,8 @@ _RELIEVED = 0.5
 _RELIEF, _EASY = 0.1, 10
 #: ... as far as the next one then moves by less than this part of the scene.
 _FAR = 0.3
+#: A stiffness below which a relaxation has failed is tried again after so many more.
+_FORGOTTEN = 4
 #: Contacts are sought anew once bodies have moved by this part of the scene, or while more than
 #: `_NEARLY_AT_REST` is left.
 _NEAR = 0.05
@@ -88,6 +95,7 @@ class LoadStepper(Stepper):
         self.solution.rates = self._of_start("rates") or still
         self.solution.forces = self._of_start("forces") or still
         self._solved: Evaluation | None = None
+        self._relaxations = _RELAXATIONS
         #: Work of each load, support, joint and obstacle and of overlap [J]; the largest energy.
         self._worked: FloatArray | float = 0.0
         self._largest = 0.0
@@ -124,6 +132,7 @@ class LoadStepper(Stepper):
         self._prepare(dt)
         old = self.state
         step, state, iterations, relaxed = self._relax(dt, time)
+        self._relaxations = _RELAXATIONS
         rates = tuple((a - b) / dt for a, b in zip(state.u, old.u, strict=True))
         forces = [t.external.copy() for t in step.bodies]
         local = []
@@ -248,13 +257,13 @@ class LoadStepper(Stepper):
         else resists all motions as the step begins, it is tried without before.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search, lowest, way, moved, tried = True, 0.0, 0.0, 0.0, False
+        search, lowest, since, way, moved, tried = True, 0.0, 0, 0.0, 0.0, False
         size = problem.lengths.radius + problem.lengths.director
         relaxed, strays = _Relaxed(self.system), iter(_STRAYS)
         problem.stabilization.share = self._stabilization
         state = replace(kept, v=self.solution.rates)
         try:
-            for _ in range(_RELAXATIONS):
+            for number in range(1, self._relaxations + 1):
                 self.interrupts.check()
                 try:
                     if self._stabilization and not tried:
@@ -287,13 +296,14 @@ class LoadStepper(Stepper):
                         advises = bool(unheld) or failure.advises
                         raise StepFailedError(f"{unheld}{failure}", advises=advises) from failure
                     problem.stabilization.share /= _RELIEF
-                    lowest = problem.stabilization.share
+                    lowest, since = problem.stabilization.share, 0
                     continue
                 iterations += step.iterations
                 told = balance.told_by_joints(problem, step)
                 relaxed.driven += told.get("external_work", 0.0)
                 state, dt = reached, 0.0
                 left, restless = unrest(problem, step)
+                self._tell_relaxed(time, number, step.iterations, restless, moved * size)
                 if left <= 1.0:
                     allowed = next(strays, np.inf)
                     if problem.couplings.contacts.strayed(step) <= allowed:
@@ -305,10 +315,14 @@ class LoadStepper(Stepper):
                     # On the facets that its nodes have come to, the rest is another one.
                     search, last = True, np.inf
                     continue
-                share = problem.stabilization.share
+                share, since = problem.stabilization.share, since + 1
+                if forgotten := since >= _FORGOTTEN:
+                    lowest, since = 0.0, 0
                 if left < _RELIEVED * last:
-                    problem.stabilization.share *= _RELIEF
-                elif step.iterations <= _EASY:
+                    # As far as Newton's method takes it, or the last digits took most repeats.
+                    fell = max(left / last, _RELIEF**3) if last < np.inf else _RELIEF
+                    problem.stabilization.share *= min(_RELIEF, fell)
+                elif step.iterations <= _EASY or forgotten:
                     lower = share * min(max(_RELIEF, moved / _FAR), 1.0)
                     problem.stabilization.share = max(lower, min(lowest, share))
                 last, way = left, moved if search else way + moved
@@ -316,12 +330,26 @@ class LoadStepper(Stepper):
                 search = left * self.newton.rtol > _NEARLY_AT_REST or way > _NEAR
         finally:
             problem.stabilization.share = 0.0
-        raise self.solver.with_flat(
-            f"step from t={kept.time:.6g}: body {restless!r} is not at rest after {_RELAXATIONS} "
-            f"relaxations, the last of which moves it by {moved * size:.3g}, {moved:.2g} of the "
-            "scene; nothing holds it, or it hops from facet to facet",
-            step,
-        )
+        slides = used_up(problem, step)
+        without_rest = self.solver.with_flat(
+            f"{slides}step from t={kept.time:.6g}: body {restless!r} is not at rest after "
+            f"{self._relaxations} relaxations, the last of which moves it by {moved * size:.3g}, "
+            f"{moved:.2g} of the scene; nothing holds it, or it hops from facet to facet",
+            step, advises=bool(slides),
+        )  # fmt: skip
+        self._relaxations = max(self._relaxations // 2, min(self._relaxations, _FEWEST))
+        raise without_rest
+
+    def _tell_relaxed(
+        self, time: float, number: int, iterations: int, restless: str, moved: float
+    ) -> None:
+        """Tell of a relaxation under stabilization, which a load step may take many of."""
+        if self.problem.stabilization.share:
+            text = f"t={time:.6g}, repeat {number} of at most {self._relaxations}"
+            self.note(text)
+            logger.info(
+                "%s: %d iterations, body %r moves by %.3g", text, iterations, restless, moved
+            )
 
     def _unheld(self, state: State, dt: float) -> str:
         """What nothing resists where a failed load step starts, or nothing. Collective."""

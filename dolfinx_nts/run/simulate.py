@@ -365,6 +365,8 @@ def _march(
     Arguments as of `run`, and the writers it has started.
     """
     pace, (dt, _) = None, steps[0]
+    if bar is not None:
+        stepper.note = bar.set_postfix_str
     if adapt is None:
         stepper.start(dt)
     else:

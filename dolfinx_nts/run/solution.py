@@ -46,10 +46,10 @@ class Solution(Record):
         - contact_load [N], a vector: the contact's force on each node, of slave and of master; its
           sums over both bodies are `contact_forces` and the opposite. Of the last step, where the
           integrator takes forces; zero before the first one.
-        - on the slave body: contact_force p_N [N], contact_pressure, that per tributary reference
-          area [Pa], contact_gap [m] (NaN where unknown), contact_status (-1 not a slave node, 0 far
-          away, 1 near, 2 in contact, 3 sticking); with friction contact_friction, the tangential
-          force [N], a vector, and contact_slip, the distance slipped so far [m].
+        - on the slave body: contact_force p_N [N], contact_pressure, that per present area around
+          the node [Pa], contact_gap [m] (NaN where unknown), contact_status (-1 not a slave node,
+          0 far away, 1 near, 2 in contact, 3 sticking); with friction contact_friction, the
+          tangential force [N], a vector, and contact_slip, the distance slipped so far [m].
 
         Args:
             body: Body of the system with a mesh.

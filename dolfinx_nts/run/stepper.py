@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from typing import Any, ClassVar
@@ -90,6 +90,7 @@ class Stepper:
         problem: Equations of the step, for those who want their parts.
         solver: The SNES that solves them.
         restart: What it goes on from, if that is a `Restart`.
+        note: Called with what goes on within a step, for those who show it.
     """
 
     #: What it computes.
@@ -138,6 +139,7 @@ class Stepper:
         self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
         close_at_exit(self)
         self.system = system
+        self.note: Callable[[str], Any] = bool
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._last_steps, self._dampers = LastSteps(), DamperWatch(self.problem)
         self.restart = begun if isinstance(begun, Restart) else None

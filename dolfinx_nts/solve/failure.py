@@ -78,31 +78,39 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
     system = problem.system
     if problem.integrator.inertia:
         return ""
-    local = np.zeros((len(system.bodies), 7))
+    # Nodes that carry and that stick, Coulomb's bound, friction, what else holds along each axis.
+    local, rubs = np.zeros((len(system.bodies), 9)), set[tuple[int, str]]()
     both = zip(problem.couplings.touching(e), problem.couplings.bodies, strict=False)
     for (k, contact, part, old), of in both:
         bodies = list(of)
         if not contact.law.num_tangential:  # may hold the body against sliding, as a wall does
-            local[bodies, 0] += part.active.sum()
+            local[bodies, 6:] += part.active.sum()
             continue
-        local[bodies, 1] += part.active.sum()
-        local[bodies, 2] += (part.active & contact.law.sticks(part)).sum()
-        local[bodies, 3] += contact.law.coefficient * old.force.sum()
+        local[bodies, 0] += part.active.sum()
+        local[bodies, 1] += (part.active & contact.law.sticks(part)).sum()
+        local[bodies, 2] += contact.law.coefficient * old.force.sum()
         # Of corners that of their slaves is opposite to that of the contact's.
         side = 1.0 if k < len(system.contacts) else -1.0
-        local[bodies, 4:] += side * old.tangential.sum(axis=0)
-    local[:, 0] += [len(body.fixed) for body in system.bodies]
+        local[bodies, 3:6] += side * old.tangential.sum(axis=0)
+        if part.active.any() or old.force.any():
+            rubs |= {(body, contact.name) for body in bodies}
+    local[:, 6:] += [np.bincount(body.fixed % 3, minlength=3) for body in system.bodies]
     for linked in system.joint_bodies:
-        local[list(linked), 0] += 1
-    held, carry, stick, bound, *friction = global_sum(system.comm, local).T
-    slide = (carry > 0) & (stick == 0)
-    slide |= (bound > 0) & (np.linalg.norm(friction, axis=0) > _USED_UP * bound)
-    found = [b.name for b, s, h in zip(system.bodies, slide, held, strict=True) if s and not h]
-    if not found:
+        local[list(linked), 6:] += 1
+    carry, stick, bound, *rest = global_sum(system.comm, local).T
+    friction, held = np.array(rest[:3]).T, np.array(rest[3:]).T > 0
+    # What is held along some axes slides along the others, if friction is along these.
+    slide = np.linalg.norm(np.where(held, 0.0, friction), axis=1) > _USED_UP * bound
+    slide &= (bound > 0) & ~held.all(axis=1)
+    slide |= (carry > 0) & (stick == 0) & ~held.any(axis=1)
+    ranks, found = system.comm.allgather(rubs), np.flatnonzero(slide)
+    if not found.size:
         return ""
+    first = int(found[0])
+    names = " and ".join(sorted({repr(name) for of in ranks for k, name in of if k == first}))
     return (
-        f"friction is used up (|F_t| = mu F_n at all nodes that carry): body {found[0]!r} slides; "
-        "use simulate, or hold it; "
+        f"friction is used up (all nodes of {names} slip: |F_t| = mu F_n, and friction can carry "
+        f"no more load): body {system.bodies[first].name!r} slides; use simulate, or hold it; "
     )
 
 

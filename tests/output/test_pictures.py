@@ -182,6 +182,12 @@ def test_the_scale_of_what_has_both_signs_is_symmetric():
     assert scale_of(values + 4.0, "stress", None, "mm").text == "von Mises stress [MPa]"
 
 
+def test_the_scale_of_contact_pressure_ends_at_its_peak():
+    values = np.r_[np.full(1000, 1.0), 7.0]
+    scale = scale_of(values, "pressure", None, "m")
+    assert scale.limits == (0.0, 7.0) and scale.extend == "neither"
+
+
 @pytest.mark.parametrize("value", [0.0, 2.5, -2.5])
 def test_a_constant_has_a_scale_that_holds_it(value):
     low, high = scale_of(np.full(9, value), "speed", None, "m").limits
@@ -248,6 +254,44 @@ def test_a_function_of_a_body_colours_it(tmp_path):
     assert drawn.values == pytest.approx(0.1 * drawn.corners[..., 0], abs=1e-12)
     with pytest.raises(ValueError, match=r"colour of body .* has shape \(3,\); return a scalar"):
         picture([body], tmp_path / "p.png", colour=lambda body: body.u)
+
+
+def test_what_hides_others_is_left_out():
+    """By itself or by name; the pressure is that of the whole scene."""
+    run = nts.equilibrium(standing(), load_steps=1)
+    soft, hard = run.system.bodies
+    floor = run.system.contacts[0].master
+
+    def left(*hide):
+        now = seen(Given.of("scene", run, hide), "pressure")
+        return [d.name for d in now.drawn], [m for m, _ in now.obstacles]
+
+    assert left() == (["block", "hard"], [floor])
+    assert left(hard, floor) == left("hard", floor.name) == (["block"], [])
+    kept = seen(Given.of("scene", run, ["hard"]), "pressure").drawn[0].values
+    whole = seen(Given.of("scene", run), "pressure").drawn[0].values
+    assert np.array_equal(kept, whole, equal_nan=True) and np.nanmax(kept) > 0.0
+    for hide, message in (
+        (["housing"], r"hide: 'housing' is not there; pass some of \['block', 'hard', "),
+        ([soft, hard], r"leave one of \['block', 'hard'\] to be seen"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Given.of("scene", run, hide)
+    with pytest.raises(TypeError, match=r"hide='hard': .* such as \['hard'\]"):
+        picture(run, "p.png", hide="hard")
+
+
+class Titles(Film):
+    """Keeps the titles of the frames in place of painting them."""
+
+    def _draw(self):
+        self.titles = [frame.title for frame in self._frames]
+
+
+def test_titles_of_load_steps_are_pseudo_times():
+    film = Titles("p.gif")
+    nts.equilibrium(standing(), load_steps=[1.0, 1.126], output=[film])
+    assert film.titles == ["pseudo time 0", "pseudo time 1", "pseudo time 1.126"]
 
 
 def test_pressure_of_what_has_no_contact(tmp_path):

@@ -389,6 +389,43 @@ def test_a_body_that_falls_for_ever_is_reported():
     assert "not at rest after 100 relaxations, the last of which moves it by" in run.status
 
 
+def test_the_repeats_of_a_load_step_are_told_and_bounded(caplog):
+    """Parts of one that has run out of them have half as many, 25 at least."""
+    free = nts.Continuum(
+        box([0, 0, 0], [1, 1, 1], [1, 1, 1], comm=MPI.COMM_SELF), RUBBER, density=DENSITY
+    )
+    system, retries = nts.System([free], gravity=(0, 0, -GRAVITY)), nts.Newton(max_retries=4)
+    with caplog.at_level("INFO", logger="dolfinx_nts.run.load_steps"):
+        nts.equilibrium(system, stabilization=0.1, newton=retries)
+    told = [r.getMessage() for r in caplog.records if "repeat" in r.getMessage()]
+    assert "repeat 1 of at most 100: " in told[0] and "body 'body' moves by " in told[0]
+    assert 100 <= len(told) <= 100 + 50 + 3 * 25
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_a_block_that_is_pushed_along_comes_to_a_wall(friction):
+    """Over two thirds of its length: the wall carries what friction, at most mu N, does not."""
+    weight, push = DENSITY * GRAVITY, 0.5 * DENSITY * GRAVITY
+    load = nts.Traction(at(0, 0.0), lambda t: (push * t, 0, 0))
+    block = nts.Continuum(
+        box([0, 0, 0], [1, 1, 1], [2, 2, 2], comm=MPI.COMM_SELF), RUBBER, density=DENSITY,
+        bcs=[nts.Dirichlet(at(1, 0.0), components=(1,))], traction=[load], name="block",
+    )  # fmt: skip
+    obstacles = (
+        (nts.Plane((0, 0, 0), (0, 0, 1)), block.surface(at(2, 0.0)), friction),
+        (nts.Plane((1.7, 0, 0), (-1, 0, 0)), block.surface(at(0, 1.0)), 0.0),
+    )
+    contacts = [nts.ContactPair(s, plane, friction=mu) for plane, s, mu in obstacles]
+    system = nts.System([block], contacts=contacts, gravity=(0, 0, -GRAVITY))
+    run = nts.equilibrium(system, load_steps=2, stabilization=0.1)
+    assert run.status.startswith("completed") and run.retries == 0
+    floor, wall = run.contact_forces[-1]
+    assert floor[2] == pytest.approx(weight, rel=1e-6)
+    assert floor[0] + wall[0] == pytest.approx(-push, rel=1e-6)
+    assert np.linalg.norm(floor[:2]) <= friction * weight + 1e-6 * weight
+    assert block.u.x.array.reshape(-1, 3)[:, 0].min() > 0.65
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", [1.0, 1e3])
 @pytest.mark.parametrize("stabilization", [0.1, 1e-2, 1e-6])
