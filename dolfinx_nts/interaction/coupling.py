@@ -103,11 +103,20 @@ class Joint:
         """
         return 0.0
 
-    def slopes(self, u: Sequence[FloatArray], history: Any) -> Slopes | None:
+    def slopes(
+        self, u: Sequence[FloatArray], history: Any, when: float | None = None
+    ) -> Slopes | None:
         """What its force does, if it is one along a coordinate and holds nothing. Collective.
 
-        A run warns of one that is too fast for its steps. Arguments are those of `potential`; None,
-        for all of them, of a joint that holds.
+        A run warns of one that is too fast for its steps.
+
+        Args:
+            u: As of `potential`.
+            history: Likewise.
+            when: Time [s]; None: a user's function of time is not asked and counts as none.
+
+        Returns:
+            None, for all arguments, of a joint that holds.
         """
         return None
 

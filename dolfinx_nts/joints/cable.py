@@ -228,7 +228,9 @@ class Cable(Joint):
         free = Memory.of(history, self.measure.weights.shape[1]).length[:, 0]
         return float(Stretched(self.axial_stiffness, free).value(path).sum())
 
-    def slopes(self, u: Sequence[FloatArray], history: FloatArray) -> Slopes | None:
+    def slopes(
+        self, u: Sequence[FloatArray], history: FloatArray, when: float | None = None
+    ) -> Slopes | None:
         """Gradient of its path, and its stiffness while taut; None of inextensible. Collective."""
         if self.axial_stiffness is None:
             return None

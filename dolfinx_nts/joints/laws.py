@@ -204,18 +204,29 @@ class Driven:
             to_at = 0.5 * move.share * gradient.mean
             bend = move.share * np.einsum("nz,nzy->ny", move.speed, gradient.change)
             to_rate = bend + move.rate * gradient.mean
-        step = _APART * (np.abs(at) + self._unit)
-        fast = _APART * (np.abs(rate) + self._unit * (move.rate or 1.0 / (move.time or 1.0)))
-        torque, more, less, ahead, behind = self._ask(
-            move.when, np.array([at, at + step, at - step, at, at]),
-            np.array([rate, rate, rate, rate + fast, rate - fast]),
-        )  # fmt: skip
-        by_at, by_rate = (more - less) / (2.0 * step), (ahead - behind) / (2.0 * fast)
+        torque, by_at, by_rate = self._asked(
+            move.when, at, rate, self._unit * (move.rate or 1.0 / (move.time or 1.0))
+        )
         return -torque, -(by_at[:, None] * to_at + by_rate[:, None] * to_rate)
 
-    def slopes(self, at: FloatArray) -> tuple[float, float]:
-        """Nothing is known of a user's function in general."""
-        return 0.0, 0.0
+    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
+        """At rest there. Collective."""
+        if when is None:
+            return 0.0, 0.0
+        _, by_at, by_rate = self._asked(when, at, np.zeros_like(at), self._unit)
+        return -float(by_at.sum()), -float(by_rate.sum())
+
+    def _asked(
+        self, when: float, at: FloatArray, rate: FloatArray, least: float
+    ) -> tuple[FloatArray, ...]:
+        """T and its derivatives, of rates that count from this on. Collective."""
+        step = _APART * (np.abs(at) + self._unit)
+        fast = _APART * (np.abs(rate) + least)
+        torque, more, less, ahead, behind = self._ask(
+            when, np.array([at, at + step, at - step, at, at]),
+            np.array([rate, rate, rate, rate + fast, rate - fast]),
+        )  # fmt: skip
+        return torque, (more - less) / (2.0 * step), (ahead - behind) / (2.0 * fast)
 
 
 class OnJoint(AlongMeasure):
