@@ -68,6 +68,8 @@ class Joint:
         driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
             their energy back refuse.
         parts: Joints beside it that come with it, such as its friction.
+        stops: What it does where it takes energy that the ledger calls `contact_defect`; it stands
+            behind the name.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Joint:
     numbers: IntArray | None = None
     driven: bool = False
     parts: tuple[Any, ...] = ()
+    stops: str = ""
 
     @cached_property
     def settings(self) -> Settings:

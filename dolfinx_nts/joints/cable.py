@@ -60,6 +60,8 @@ class Cable(Joint):
         UserFunctionError: length raises, or is not a positive number.
     """
 
+    stops = ", a cable that became taut"
+
     def __init__(
         self,
         points: Sequence[tuple[Body | None, Vector]],

@@ -207,7 +207,8 @@ class Driven:
         torque, by_at, by_rate = self._asked(
             move.when, at, rate, self._unit * (move.rate or 1.0 / (move.time or 1.0))
         )
-        return -torque, -(by_at[:, None] * to_at + by_rate[:, None] * to_rate)
+        by_end: FloatArray = by_at[:, None] * to_at + by_rate[:, None] * to_rate
+        return -torque, -by_end
 
     def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
         """At rest there. Collective."""
@@ -252,6 +253,7 @@ class OnJoint(AlongMeasure):
         self.of, self._here, self.numbers = joint, joint._here, joint.numbers
         self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
         self.law, self.entry = law, entry
+        self.stops = ", which stopped a joint" if isinstance(law, Limits) else ""
 
 
 def laws_on(

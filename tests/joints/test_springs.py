@@ -605,7 +605,7 @@ def test_a_spring_that_steps_do_not_resolve_is_told():
 
 @pytest.mark.mpi
 def test_a_motor_that_steps_do_not_resolve_is_told():
-    """As the spring and the damper that it is: omega h, c h/m, of the time at which a run starts."""
+    """As the spring and the damper that it is: omega h and c h/m where a run starts."""
 
     def told_of(torque, **options):
         arm = nts.RigidBody.from_inertia(2, (1, 1, 1), centre=(0, 0, 0), angular_velocity=(0, 0, 1))
