@@ -207,7 +207,7 @@ class Driven:
         torque, by_at, by_rate = self._asked(
             move.when, at, rate, self._unit * (move.rate or 1.0 / (move.time or 1.0))
         )
-        by_end: FloatArray = by_at[:, None] * to_at + by_rate[:, None] * to_rate
+        by_end: Any = by_at[:, None] * to_at + by_rate[:, None] * to_rate
         return -torque, -by_end
 
     def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:

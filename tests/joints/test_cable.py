@@ -233,6 +233,16 @@ PINS = {
 }
 
 
+def test_a_weight_that_a_winch_pulls_into_an_eyelet():
+    """After 0.5 s nothing is left to pull at, and the run says so, not what is usual."""
+    load, _, system = hung(length=lambda t: WAY - 2.0 * t)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=1.0)
+    assert run.balance["time"][-1] == pytest.approx(0.5, rel=1e-3)
+    assert abs(load.position[2]) < 1e-3 * WAY
+    assert "part 2 of 'rope' has shrunk to length 0" in run.status
+    assert "let its winch (length=) stop" in run.status and "cells" not in run.status
+
+
 @pytest.mark.parametrize("number", PINS)
 @pytest.mark.parametrize("wound", [-0.2, 0.2])
 def test_capstan(number, wound):
