@@ -371,8 +371,9 @@ def _both(name: str, limits: Any) -> tuple[float, float]:
         low = high = np.nan
     if not (low <= 0.0 <= high and (is_finite(low) or is_finite(high))):
         raise ValueError(
-            f"{name}={limits!r}: pass the smallest and the largest angle [rad] or way [m] from the "
-            "start, around 0, e.g. (-1.0, 0.5); infinite is no limit"
+            f"{name}={limits!r}: pass the smallest and the largest angle [rad] or way [m], e.g. "
+            "(-1.0, 0.5), -math.inf or math.inf where there is none; they count from the start, "
+            "where each joint is at 0, so that 0 has to be between them"
         )
     return low, high
 

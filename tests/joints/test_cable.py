@@ -116,6 +116,17 @@ def test_a_slack_cable_stops_a_weight_as_a_limit_does(rule):
     assert lost[-1] > 0.1 and lost == pytest.approx(other.balance["contact_defect"], abs=1e-10)
 
 
+def test_tensions_of_a_cable_that_has_become_taut_alternate_about_the_weight():
+    """Their mean over two steps is the weight."""
+    _, cable, system = hung(length=WAY + 0.03)
+    motions = Motions(cable)
+    nts.simulate(system, nts.EnergyMomentum(), dt=0.007, t_end=0.6, output=[motions])
+    hangs = slice(-10, None)
+    assert np.ptp(motions["rope tensions"][hangs]) > G
+    assert motions["rope mean tensions"][hangs] == pytest.approx(3.0 * G, rel=1e-9)
+    assert motions["rope mean tensions"].shape == motions["rope tensions"].shape
+
+
 @rules
 @pytest.mark.parametrize("mu", [0.05, 0.3, 1.5])
 @pytest.mark.fast("0.3-energy-momentum")
