@@ -393,7 +393,8 @@ def _asking(joint: Any, argument: str, motor: Motor) -> Callable[..., FloatArray
 
     def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
         return call_together(
-            joint.comm, f"{argument} of {joint.name!r}", of, time, at, rate, shown=motor
-        )
+            joint.comm, f"{argument} of {joint.name!r} at t={time:.6g}", of, time, at, rate,
+            shown=motor,
+        )  # fmt: skip
 
     return ask

@@ -272,6 +272,22 @@ def test_a_motor_is_not_asked_about_an_iterate_that_runs_off():
     assert asked == [(0.5, 3.0)]
 
 
+def test_a_motor_that_raises_is_told_with_time_and_line(caplog):
+    """Of the step in whose middle it does; the traceback is for those who ask for it."""
+
+    def motor(t, angle, rate):
+        return 1.0 / (t < 0.5)
+
+    line = motor.__code__.co_firstlineno + 1
+    _, system = disc(0.0, motor=motor)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.1, t_end=1.0)
+    assert run.balance["time"][-1] == pytest.approx(0.5, rel=1e-12)
+    assert run.status.startswith("motor of 'hinge' at t=0.55: ")
+    assert f"raised ZeroDivisionError('float division by zero'), line {line} of" in run.status
+    told = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert told and not any(record.exc_info for record in told)
+
+
 @pytest.mark.fast_on_ranks()
 def test_a_motor_does_work():
     """A constant torque on a disc: w = T t/I, and its work is the energy."""
