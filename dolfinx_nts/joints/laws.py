@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.interaction.carried import no_memory
+from dolfinx_nts.interaction.measured import leans
 from dolfinx_nts.interaction.measures import Move, Row, columns
 from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.kernels import measures as kernel
@@ -46,7 +48,8 @@ class JointFriction:
         coefficient: Of friction mu [-], in place of `bound`: it sticks up to mu R, or the torque
             mu r R, with R the force of the joint's bearing in the step: of a revolute
             or spherical joint on its point, of what slides along an axis that at right angles to
-            this, of a plane that along its normal. Moments that a bearing carries add nothing.
+            this, of a plane that along its normal. It is a mean of three steps, which does not
+            alternate. Moments that a bearing carries add nothing.
         radius: Of the pin, the ball or the ring that carries, r [m]; of what turns.
 
     Raises:
@@ -254,6 +257,13 @@ class OnJoint(AlongMeasure):
         self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
         self.law, self.entry = law, entry
         self.stops = ", which stopped a joint" if isinstance(law, Limits) else ""
+
+    def start(self) -> FloatArray:
+        """With the memory of what its joint carries, if it depends on that."""
+        found = super().start()
+        if not leans(self.law):
+            return found
+        return np.hstack([found, no_memory(self._here, self.of.bearing)])
 
 
 def laws_on(

@@ -558,6 +558,32 @@ def test_friction_of_a_pin_takes_the_reaction_of_its_step(reach):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.parametrize("part", [0.9, 1.1])
+def test_friction_of_a_pin_takes_the_load_of_a_cable_that_alternates(part):
+    """A weight has become taut at a mast, whose pin carries 30 kg g; a torque acts from then on.
+
+    Up to mu r times that it sticks; beyond it the mast and the weight on its rail turn by t^2/2.
+    """
+    mast = nts.RigidBody.from_inertia(10.0, (2, 2, 2), centre=(0, 0, 0), name="mast")
+    load = nts.RigidBody.from_inertia(20.0, (0.2, 0.2, 0.2), centre=(1, 0, -1), name="load")
+    bound = 0.1 * 0.1 * 30.0 * G
+    pin = nts.Revolute(
+        mast, None, point=(0, 0, 0), axis=(0, 0, 1), name="pin",
+        friction=nts.JointFriction(coefficient=0.1, radius=0.1),
+        motor=lambda t, angle, rate: part * bound * (t > 0.5),
+    )  # fmt: skip
+    rail = nts.Prismatic(load, mast, point=(1, 0, -1), axis=(0, 0, 1))
+    rope = nts.Cable([(mast, (1, 0, 0)), (load, (1, 0, -1))], length=1.02)
+    system = nts.System([mast, load], joints=[pin, rail, rope], gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.8)
+    assert run.status == "completed" and "ledger" not in run.warnings
+    assert np.ptp(run.reactions["pin"][-10:, 0, 2]) > 10.0 * G
+    turned = np.arcsin(mast.rotation[1, 0])
+    turn = 0.5 * 0.3**2 * max(part - 1.0, 0.0) * bound / (2.0 + 0.2 + 20.0)
+    # The pull that turns the weight about adds to the load.
+    assert turned == pytest.approx(turn, rel=1e-5, abs=1e-9 * 0.3**2)
+
+
 def test_friction_of_a_rail_by_what_it_carries():
     """A slider on a slope: a = g (sin - mu cos), or it sticks."""
     tilt, mu = 0.5, 0.3
