@@ -80,6 +80,11 @@ class Joint:
     parts: tuple[Any, ...] = ()
     stops: str = ""
 
+    def __repr__(self) -> str:
+        # One of a class of the user's own may not have its name yet.
+        of = ", ".join(repr(body.name) for body in getattr(self, "bodies", ()))
+        return f"<{type(self).__name__} {getattr(self, 'name', '')!r} of {of}>"
+
     @cached_property
     def settings(self) -> Settings:
         """Numbers and texts by name that it was made with, for JSON and the same on all ranks.
