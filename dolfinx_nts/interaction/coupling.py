@@ -128,11 +128,12 @@ class Joint:
         """
         return None
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
         """What pictures show of it. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
+            when: Time [s].
         """
         return Sketch()
 

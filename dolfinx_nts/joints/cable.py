@@ -12,7 +12,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.interaction.sketch import Sketch, moved
+from dolfinx_nts.interaction.sketch import DASHED, STRAIGHT, Sketch, along, moved
 from dolfinx_nts.joints.between import ROUNDED, Motion, points_of
 from dolfinx_nts.joints.cable_elements import CableCoupling, Memory
 from dolfinx_nts.kernels.cable import Lengths, Stretched
@@ -171,10 +171,14 @@ class Cable(Joint):
                 "axial_stiffness=, as an elastic cable may start with tension"
             )
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
-        """Its path, straight also where it is slack, and its points. Collective."""
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
+        """Its path, dashed while it is slack, and its points. Collective."""
         path = moved(self._held, self.bodies, u)
-        return Sketch(np.stack([path[:-1], path[1:]], axis=1), path)
+        parts = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        slack = parts.sum() < (1.0 - ROUNDED) * self.length_at(when)
+        shape = DASHED if slack else STRAIGHT
+        lines = [along(np.array(ends), shape, 0.0) for ends in pairwise(path)]
+        return Sketch(np.concatenate(lines), path)
 
     def length_at(self, time: float) -> float:
         """Its length without tension at a time [m]. Collective.

@@ -166,7 +166,7 @@ class BetweenPoints(AlongMeasure):
         rounded = length <= _ROUNDED * max(map(np.linalg.norm, given))
         self.distance = 0.0 if rounded else length
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
         """Its shape between the points. Collective."""
         ends = moved(self._ends, self.bodies, u)
         return Sketch(along(ends, self.shape, self.distance), ends)
