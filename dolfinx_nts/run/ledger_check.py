@@ -201,12 +201,13 @@ class LedgerCheck:
             if not asked and enough and now > self._rounding:
                 system, (most, when, where) = self._solution.system, self._jerk
                 joints = any(joint.stops for joint in system.joints)
-                who = [*["nodes"] * nodes, *["limits and cables"] * joints] or ["joints"]
+                who = "limits and cables" if joints else "" if nodes else "joints"
+                who = ", ".join(["nodes"] * nodes + [who] * bool(who))
                 moved = any(x.driven for x in (*system.contacts, *system.joints, *system.bodies))
                 restored = "impact='restored' with EnergyMomentum or Midpoint"
                 self._solution.warn(
                     "energy lost to contact", row["time"], lost,
-                    f"{' and '.join(who)} that begin or cease to act in mid step took an energy "
+                    f"{who} that begin or cease to act in mid step took an energy "
                     f"of {lost:.3g}, "
                     f"{self._part(lost):.2g} of the largest energy, the most in the step to "
                     f"t={when:.6g}: {most:.3g}{f', by {where}' * bool(where)}; how bodies rebound "
