@@ -249,6 +249,17 @@ def reference() -> dict[str, str]:
     return {f"api_{title}.md": api_page(title, names) for title, names in groups.items()}
 
 
+def members(of: type) -> str:
+    """Options of a class's section: of joints, springs and cables what scenes call alone."""
+    import dolfinx_nts
+
+    bases = dolfinx_nts.Joint, dolfinx_nts.BetweenPoints, dolfinx_nts.AboutAxis
+    if not issubclass(of, dolfinx_nts.Joint) or of in bases:
+        return CLASS
+    called = ", ".join(name for name in ("about", "tensions") if hasattr(of, name))
+    return (f":members: {called}\n   " if called else "") + ":show-inheritance:"
+
+
 def api_page(title: str, names: list[str]) -> str:
     """A page of the reference: a section for each name of the package, then whole modules."""
     import dolfinx_nts
@@ -260,7 +271,7 @@ def api_page(title: str, names: list[str]) -> str:
         else:
             kind = "class" if isinstance(getattr(dolfinx_nts, name), type) else "function"
             lines += [f"## {name}", "```{eval-rst}", f".. auto{kind}:: dolfinx_nts.{name}"]
-            lines += [f"   {CLASS}"] if kind == "class" else []
+            lines += [f"   {members(getattr(dolfinx_nts, name))}"] if kind == "class" else []
         lines += ["```"]
     return "\n".join(lines) + "\n"
 

@@ -27,6 +27,8 @@ from dolfinx_nts.validation import items, known_options, require_same, vector
 
 #: Overlap over the sag of facets up to which these alone may be its cause.
 _SAGS = 1.1
+#: Names of a kind that its one-line description shows.
+_SHOWN = 8
 
 
 @known_options
@@ -126,6 +128,16 @@ class System:
         self._check_sides(start)
         self._check_penetration(depths, jumps(self.bodies))
         self._check_enclosed(start)
+
+    def __repr__(self) -> str:
+        members = {
+            "bodies": self.bodies, "contacts": self.contacts, "joints": self.declared_joints
+        }  # fmt: skip
+        named = []
+        for kind, those in members.items():
+            names = ", ".join(repr(item.name) for item in those[:_SHOWN])
+            named += [f"{kind} {names}{', ...' * (len(those) > _SHOWN)}"] if those else []
+        return f"<System of {'; '.join(named)}>"
 
     def _check_bodies(self) -> None:
         """Raise a ValueError unless bodies differ, have different names, and one communicator."""

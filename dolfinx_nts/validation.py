@@ -9,6 +9,7 @@ import inspect
 import math
 import numbers
 import os
+import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -256,6 +257,13 @@ def items(name: str, value: object, fits: Callable[[Any], bool], wanted: str) ->
     return found
 
 
+def _line(error: Exception) -> str:
+    """Where an error was raised, if that is not in this package."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    path = Path(last.filename)
+    return "" if Path(__file__).parent in path.parents else f", line {last.lineno} of {path.name}"
+
+
 def call_together(
     comm: MPI.Comm, name: str, function: Callable[..., Any], *arguments: Any, shown: Any = None
 ) -> Any:
@@ -276,7 +284,7 @@ def call_together(
         value = function(*arguments)
     except Exception as error:  # any: a rank that raises alone would leave the others waiting
         what = function if shown is None else shown
-        cause, problem = error, f"{name}: {what!r} raised {error!r}; correct it"
+        cause, problem = error, f"{name}: {what!r} raised {error!r}{_line(error)}; correct it"
     raise_together(comm, problem, UserFunctionError, cause)
     return value
 

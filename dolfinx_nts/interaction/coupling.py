@@ -68,6 +68,8 @@ class Joint:
         driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
             their energy back refuse.
         parts: Joints beside it that come with it, such as its friction.
+        stops: What it does where it takes energy that the ledger calls `contact_defect`; it stands
+            behind the name.
     """
 
     name: str
@@ -76,6 +78,12 @@ class Joint:
     numbers: IntArray | None = None
     driven: bool = False
     parts: tuple[Any, ...] = ()
+    stops: str = ""
+
+    def __repr__(self) -> str:
+        # One of a class of the user's own may not have its name yet.
+        of = ", ".join(repr(body.name) for body in getattr(self, "bodies", ()))
+        return f"<{type(self).__name__} {getattr(self, 'name', '')!r} of {of}>"
 
     @cached_property
     def settings(self) -> Settings:
@@ -103,19 +111,29 @@ class Joint:
         """
         return 0.0
 
-    def slopes(self, u: Sequence[FloatArray], history: Any) -> Slopes | None:
+    def slopes(
+        self, u: Sequence[FloatArray], history: Any, when: float | None = None
+    ) -> Slopes | None:
         """What its force does, if it is one along a coordinate and holds nothing. Collective.
 
-        A run warns of one that is too fast for its steps. Arguments are those of `potential`; None,
-        for all of them, of a joint that holds.
+        A run warns of one that is too fast for its steps.
+
+        Args:
+            u: As of `potential`.
+            history: Likewise.
+            when: Time [s]; None: a user's function of time is not asked and counts as none.
+
+        Returns:
+            None, for all arguments, of a joint that holds.
         """
         return None
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
         """What pictures show of it. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
+            when: Time [s].
         """
         return Sketch()
 

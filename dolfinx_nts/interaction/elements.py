@@ -19,6 +19,8 @@ from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 _EPS = float(np.finfo(float).eps)
+#: What a failed step is told of an element that has shrunk to a point, with what to do.
+NO_DIRECTION = "no direction in which to pull"
 #: Elements, and what they raised.
 Raised = tuple[Any, Exception]
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
+from dolfinx_nts.interaction.carried import Carried
 from dolfinx_nts.interaction.constraint_elements import SHIFT, TINY, largest_of_joints
 from dolfinx_nts.interaction.elements import Step, Stopped
 from dolfinx_nts.interaction.kinematics import Kinematics
@@ -35,7 +36,7 @@ class MeasuredPart(NamedTuple):
         tangent: Its derivative.
         status: What may flip, shape (1, n); (0, n) without multiplier.
         memory: The measure at t_{n+1}, and with a multiplier D and where the measure began, shape
-            (n, 1) or (n, 3).
+            (n, 1) or (n, 3), or (n, 3 + c) with the memory of `Carried`.
         work: Of the force against the motion of the step [J], shape (n,).
         law: As it was obeyed.
     """
@@ -67,6 +68,7 @@ class MeasuredElements(PointElements):
         rest: Reference values of the nodes [m], shape (n, k, 3).
         names: Of the joints that they are of.
         joint: Number of each element's joint among these, shape (n,).
+        carried: Of a law that depends on what its joint carries, the memory of `Carried`.
     """
 
     measure: Measure
@@ -82,6 +84,7 @@ class MeasuredElements(PointElements):
     rest: FloatArray
     names: Sequence[str]
     joint: IntArray
+    carried: FloatArray
 
     @property
     def widths(self) -> Mapping[str, int]:
@@ -114,8 +117,10 @@ class MeasuredElements(PointElements):
         du, held, law = x - self.y0, holds(self.law), self.law
         leaning = leans(law)
         if leaning:
-            load = np.linalg.norm(own["load"], axis=1)
-            law = law.under(load / factor)
+            inertia = self.step.integrator.inertia
+            carried = Carried.of(own["load"] / factor, self.carried, inertia=inertia)
+            load = np.linalg.norm(carried.force, axis=1)
+            law = law.under(load)
         end = measure.vectors(x)
         if theta is None:
             (a, b), at_a = (self._start, end), self.near
@@ -164,7 +169,9 @@ class MeasuredElements(PointElements):
             measure.weights, *gradient[:2], ends, pull, slope, *of_row, du, residual, tangent, work,
         )  # fmt: skip
         if leaning:
-            across = own["load"] / np.maximum(load, TINY)[:, None] * own["by_unknowns"]
+            way = carried.share * carried.force / np.maximum(load, TINY)[:, None]
+            across = way * own["by_unknowns"]
+            memory = np.hstack([memory, carried.memory])
             slope = self.scale * row.by_bound * law.by_load / self.force_scale
             tangent = _widened(tangent, slope[:, None] * across)
         if held and not self.step.integrator.inertia:
@@ -315,6 +322,7 @@ class Measured(EveryStep):
             name=self._name, sides=measure.sides, measure=measure, law=self.law, step=step, y0=y0,
             drift=drift, near=near, since=since, before=before, entry=self._joints[0].entry,
             scale=scale, rest=self._rest, names=self._names, joint=self._joint,
+            carried=memory[:, 3:],
         )  # fmt: skip
 
     def _scales(self, step: Step) -> FloatArray:

@@ -116,8 +116,13 @@ class Law(Protocol):
     def pull(self, move: Move) -> tuple[FloatArray, FloatArray]:
         """D, shape (n,), and its derivative by the vectors at t_{n+1}, shape (n, 3 v)."""
 
-    def slopes(self, at: FloatArray) -> tuple[float, float]:
-        """Derivatives of D by the measure and by its rate on this rank. Collective."""
+    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
+        """Derivatives of D by the measure and by its rate on this rank. Collective.
+
+        Args:
+            at: The measure.
+            when: Time [s]; None: of a function of time none are asked for.
+        """
 
 
 class Row(NamedTuple):

@@ -82,6 +82,8 @@ def _dashpot(start: float, piston: float, end: float, radius: float) -> Shape:
 
 
 STRAIGHT = _chain([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+#: Eight lines, and seven gaps as long as these.
+DASHED = _chain(np.pad(np.linspace(0.0, 1.0, 16)[:, None], ((0, 0), (0, 2))))[::2]
 COIL, DASHPOT = _coil(7, 0.08, 0.12), _dashpot(0.35, 0.55, 0.7, 0.06)
 
 

@@ -207,7 +207,7 @@ class Between(OfTwo, ABC):
         """
         return ()
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
         """Both points, the line between them, and the axes at the first. Collective."""
         both = zip(self.sides, u, strict=True)
         y = np.concatenate([side.reference + side.nodal(v) for side, v in both], axis=1)[0]

@@ -12,7 +12,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.interaction.sketch import Sketch, moved
+from dolfinx_nts.interaction.sketch import DASHED, STRAIGHT, Sketch, along, moved
 from dolfinx_nts.joints.between import ROUNDED, Motion, points_of
 from dolfinx_nts.joints.cable_elements import CableCoupling, Memory
 from dolfinx_nts.kernels.cable import Lengths, Stretched
@@ -59,6 +59,8 @@ class Cable(Joint):
             of a flexible body, or an inextensible cable is shorter than its path at the start.
         UserFunctionError: length raises, or is not a positive number.
     """
+
+    stops = ", a cable that became taut"
 
     def __init__(
         self,
@@ -169,10 +171,14 @@ class Cable(Joint):
                 "axial_stiffness=, as an elastic cable may start with tension"
             )
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
-        """Its path, straight also where it is slack, and its points. Collective."""
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
+        """Its path, dashed while it is slack, and its points. Collective."""
         path = moved(self._held, self.bodies, u)
-        return Sketch(np.stack([path[:-1], path[1:]], axis=1), path)
+        parts = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        slack = parts.sum() < (1.0 - ROUNDED) * self.length_at(when)
+        shape = DASHED if slack else STRAIGHT
+        lines = [along(np.array(ends), shape, 0.0) for ends in pairwise(path)]
+        return Sketch(np.concatenate(lines), path)
 
     def length_at(self, time: float) -> float:
         """Its length without tension at a time [m]. Collective.
@@ -228,7 +234,9 @@ class Cable(Joint):
         free = Memory.of(history, self.measure.weights.shape[1]).length[:, 0]
         return float(Stretched(self.axial_stiffness, free).value(path).sum())
 
-    def slopes(self, u: Sequence[FloatArray], history: FloatArray) -> Slopes | None:
+    def slopes(
+        self, u: Sequence[FloatArray], history: FloatArray, when: float | None = None
+    ) -> Slopes | None:
         """Gradient of its path, and its stiffness while taut; None of inextensible. Collective."""
         if self.axial_stiffness is None:
             return None

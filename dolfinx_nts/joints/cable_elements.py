@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.interaction.constraint_elements import SHIFT
-from dolfinx_nts.interaction.elements import Step, Stopped
+from dolfinx_nts.interaction.elements import NO_DIRECTION, Step, Stopped
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.kernels.cable import Lengths, Stretched, turns
@@ -31,6 +31,8 @@ from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 _STEEP = 1e3
 #: Part of its length within which a cable is taut.
 _TAUT = 8.0 * float(np.finfo(float).eps)
+#: Part of its length from which on a part is told that may have drawn two points together.
+_SHORT = 1e-3
 
 
 class CablePart(NamedTuple):
@@ -331,7 +333,15 @@ class CableElements(PointElements):
     def describe(self, part: Any, flips: Any) -> tuple[float, str]:
         """Its rows, and how often it became taut or slack, or stuck or slipped."""
         weight, text = super().describe(part, flips)
-        return weight, f"{text}, flips {int(flips.sum())} times" if flips.any() else text
+        text = f"{text}, flips {int(flips.sum())} times" if flips.any() else text
+        parts = Lengths.each(self.measure.vectors(self.y0)).ravel()
+        k = int(parts.argmin())
+        if parts[k] > _SHORT * parts.sum():
+            return weight, text
+        return weight, (
+            f"{text}, part {k + 1} of {self.name!r} has shrunk to length 0, or nearly, and has "
+            f"{NO_DIRECTION}: let its winch (length=) stop before a point reaches the next one"
+        )
 
 
 def winch_work(

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.interaction.carried import Carried, no_memory
 from dolfinx_nts.interaction.constraint_elements import SHIFT, TINY
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.kinematics import Kinematics
@@ -69,7 +70,8 @@ class DirectedPart(NamedTuple):
         residual: Rows of coordinates and of multipliers [kg m].
         tangent: Its derivative.
         status: What sticks of its groups, shape (groups, n).
-        memory: D, and the vectors where the slip began, shape (n, m + 3 v).
+        memory: D, and the vectors where the slip began, shape (n, m + 3 v), or (n, m + 3 v + c)
+            with the memory of `Carried`.
         work: Of D against the motion of the step [J], shape (n,).
     """
 
@@ -93,6 +95,7 @@ class DirectedElements(PointElements):
         since: The vectors where the slip began, shape (n, v, 3).
         before: D at t_n, shape (n, m).
         scale: Force per motion in the units of the step, shape (n,).
+        carried: Of a law that depends on what its joint carries, the memory of `Carried`.
     """
 
     measure: Measure
@@ -102,6 +105,7 @@ class DirectedElements(PointElements):
     since: FloatArray
     before: FloatArray
     scale: FloatArray
+    carried: FloatArray
 
     @property
     def bilateral(self) -> bool:
@@ -132,10 +136,13 @@ class DirectedElements(PointElements):
         if not law.by_load:
             bound = np.broadcast_to(law.bound, (len(x), 1))
             return self._obeyed(x, own["constraints"], self.forms, bound)
-        load = np.linalg.norm(own["load"], axis=1)[:, None]
-        across = own["load"] / np.maximum(load, TINY) * own["by_unknowns"]
-        bound, slopes = law.by_load * load / self.step.factor, law.by_load * across[:, None]
-        return self._obeyed(x, own["constraints"], self.forms, bound, slopes)
+        inertia, factor = self.step.integrator.inertia, self.step.factor
+        carried = Carried.of(own["load"] / factor, self.carried, inertia=inertia)
+        load = np.linalg.norm(carried.force, axis=1)[:, None]
+        across = carried.share * carried.force / np.maximum(load, TINY) * own["by_unknowns"]
+        bound, slopes = law.by_load * load, law.by_load * across[:, None]
+        part = self._obeyed(x, own["constraints"], self.forms, bound, slopes)
+        return part._replace(memory=np.hstack([part.memory, carried.memory]))
 
     def _obeyed(
         self, x: FloatArray, force: FloatArray, forms: FloatArray, bound: FloatArray,
@@ -241,11 +248,13 @@ class DirectedCoupling(EveryStep):
         joint, measure = self._joint, self._joint.measure
         y0 = measure.reference() + measure.nodal([step.state.u[b] for b in self.bodies[0]])
         m, p0 = sum(measure.kind.groups), measure.vectors(y0)
-        since = p0 if step.dt else history[:, m:].reshape(p0.shape)
+        _, begun, carried = np.split(history, [m, m + 3 * p0.shape[1]], axis=1)
+        since = p0 if step.dt else begun.reshape(p0.shape)
         scale = min(step.mean_scale(side.body) for side in measure.sides)
         return self._of(
             name=joint.name, sides=measure.sides, measure=measure, law=joint.law, step=step, y0=y0,
             since=since, before=history[:, :m], scale=np.full(len(y0), scale),
+            carried=carried,
         )  # fmt: skip
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
@@ -299,7 +308,10 @@ class DirectedFriction(OfTwo):
 
     def start(self) -> FloatArray:
         """No force."""
-        return at_start(self.measure)
+        found = at_start(self.measure)
+        if not self.law.by_load:
+            return found
+        return np.hstack([found, no_memory(len(found), self.of.bearing)])
 
     def coupling(self, bodies: tuple[int, ...]) -> DirectedCoupling:
         """What makes its elements in a run, and remembers its forces."""

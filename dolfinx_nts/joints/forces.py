@@ -96,12 +96,15 @@ class AlongMeasure(OfTwo):
         y = measure.reference() + measure.nodal(u)
         return y, measure.kind.value(measure.vectors(y), history[:, 0])
 
-    def slopes(self, u: Sequence[FloatArray], history: FloatArray) -> Slopes | None:
+    def slopes(
+        self, u: Sequence[FloatArray], history: FloatArray, when: float | None = None
+    ) -> Slopes | None:
         """Gradient of the measure, and derivatives of the force; None if it holds. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
             history: What it remembers there, the measure first.
+            when: As of `Joint.slopes`.
         """
         if holds(self.law):
             return None
@@ -113,7 +116,7 @@ class AlongMeasure(OfTwo):
         for side in measure.sides:
             here = slice(first, first := first + side.nodes.shape[1])
             gradients.append(side.gathered(along[:, here]))
-        stiffness, damping = self.comm.allreduce(np.array(self.law.slopes(at))).tolist()
+        stiffness, damping = self.comm.allreduce(np.array(self.law.slopes(at, when))).tolist()
         return Slopes(gradients, stiffness, damping, measure.kind is kernel.Angle)
 
     def coupling(self, bodies: tuple[int, ...]) -> Measured:
@@ -163,7 +166,7 @@ class BetweenPoints(AlongMeasure):
         rounded = length <= _ROUNDED * max(map(np.linalg.norm, given))
         self.distance = 0.0 if rounded else length
 
-    def sketch(self, u: Sequence[FloatArray]) -> Sketch:
+    def sketch(self, u: Sequence[FloatArray], when: float = 0.0) -> Sketch:
         """Its shape between the points. Collective."""
         ends = moved(self._ends, self.bodies, u)
         return Sketch(along(ends, self.shape, self.distance), ends)
@@ -271,7 +274,7 @@ class Stiff:
         mean, change = self._ask(self._energy.quotient, *move.ends)
         return mean, move.share * change[:, None] * move.gradient.end
 
-    def slopes(self, at: FloatArray) -> tuple[float, float]:
+    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
         """V'' and none. Collective."""
         _, change = self._ask(self._energy.quotient, at, at)
         return 2.0 * float(change.sum()), 0.0
@@ -313,7 +316,7 @@ class Viscous(NamedTuple):
         by_end = bend + move.rate * gradient.mean
         return self.damping * rate, np.reshape(self.damping, (-1, 1)) * by_end
 
-    def slopes(self, at: FloatArray) -> tuple[float, float]:
+    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
         """None and c."""
         return 0.0, self.damping * len(at)
 

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.interaction.carried import no_memory
+from dolfinx_nts.interaction.measured import leans
 from dolfinx_nts.interaction.measures import Move, Row, columns
 from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.kernels import measures as kernel
@@ -46,7 +48,8 @@ class JointFriction:
         coefficient: Of friction mu [-], in place of `bound`: it sticks up to mu R, or the torque
             mu r R, with R the force of the joint's bearing in the step: of a revolute
             or spherical joint on its point, of what slides along an axis that at right angles to
-            this, of a plane that along its normal. Moments that a bearing carries add nothing.
+            this, of a plane that along its normal. It is a mean of three steps, which does not
+            alternate. Moments that a bearing carries add nothing.
         radius: Of the pin, the ball or the ring that carries, r [m]; of what turns.
 
     Raises:
@@ -204,18 +207,30 @@ class Driven:
             to_at = 0.5 * move.share * gradient.mean
             bend = move.share * np.einsum("nz,nzy->ny", move.speed, gradient.change)
             to_rate = bend + move.rate * gradient.mean
+        torque, by_at, by_rate = self._asked(
+            move.when, at, rate, self._unit * (move.rate or 1.0 / (move.time or 1.0))
+        )
+        by_end: Any = by_at[:, None] * to_at + by_rate[:, None] * to_rate
+        return -torque, -by_end
+
+    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
+        """At rest there. Collective."""
+        if when is None:
+            return 0.0, 0.0
+        _, by_at, by_rate = self._asked(when, at, np.zeros_like(at), self._unit)
+        return -float(by_at.sum()), -float(by_rate.sum())
+
+    def _asked(
+        self, when: float, at: FloatArray, rate: FloatArray, least: float
+    ) -> tuple[FloatArray, ...]:
+        """T and its derivatives, of rates that count from this on. Collective."""
         step = _APART * (np.abs(at) + self._unit)
-        fast = _APART * (np.abs(rate) + self._unit * (move.rate or 1.0 / (move.time or 1.0)))
+        fast = _APART * (np.abs(rate) + least)
         torque, more, less, ahead, behind = self._ask(
-            move.when, np.array([at, at + step, at - step, at, at]),
+            when, np.array([at, at + step, at - step, at, at]),
             np.array([rate, rate, rate, rate + fast, rate - fast]),
         )  # fmt: skip
-        by_at, by_rate = (more - less) / (2.0 * step), (ahead - behind) / (2.0 * fast)
-        return -torque, -(by_at[:, None] * to_at + by_rate[:, None] * to_rate)
-
-    def slopes(self, at: FloatArray) -> tuple[float, float]:
-        """Nothing is known of a user's function in general."""
-        return 0.0, 0.0
+        return torque, (more - less) / (2.0 * step), (ahead - behind) / (2.0 * fast)
 
 
 class OnJoint(AlongMeasure):
@@ -241,6 +256,14 @@ class OnJoint(AlongMeasure):
         self.of, self._here, self.numbers = joint, joint._here, joint.numbers
         self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
         self.law, self.entry = law, entry
+        self.stops = ", which stopped a joint" if isinstance(law, Limits) else ""
+
+    def start(self) -> FloatArray:
+        """With the memory of what its joint carries, if it depends on that."""
+        found = super().start()
+        if not leans(self.law):
+            return found
+        return np.hstack([found, no_memory(self._here, self.of.bearing)])
 
 
 def laws_on(
@@ -358,8 +381,9 @@ def _both(name: str, limits: Any) -> tuple[float, float]:
         low = high = np.nan
     if not (low <= 0.0 <= high and (is_finite(low) or is_finite(high))):
         raise ValueError(
-            f"{name}={limits!r}: pass the smallest and the largest angle [rad] or way [m] from the "
-            "start, around 0, e.g. (-1.0, 0.5); infinite is no limit"
+            f"{name}={limits!r}: pass the smallest and the largest angle [rad] or way [m], e.g. "
+            "(-1.0, 0.5), -math.inf or math.inf where there is none; they count from the start, "
+            "where each joint is at 0, so that 0 has to be between them"
         )
     return low, high
 
@@ -379,7 +403,8 @@ def _asking(joint: Any, argument: str, motor: Motor) -> Callable[..., FloatArray
 
     def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
         return call_together(
-            joint.comm, f"{argument} of {joint.name!r}", of, time, at, rate, shown=motor
-        )
+            joint.comm, f"{argument} of {joint.name!r} at t={time:.6g}", of, time, at, rate,
+            shown=motor,
+        )  # fmt: skip
 
     return ask

@@ -321,14 +321,29 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
     return max(problem.system.comm.allgather(best))[1]
 
 
-def largest_loss(problem: StepProblem, step: Evaluation) -> str:
-    """The contact or joint whose touches take most energy in a step; "": none. Collective."""
-    losses = {"": 0.0}
-    for elements, part in zip(problem.elements, step.parts, strict=True):
+def largest_loss(
+    problem: StepProblem, step: Evaluation, before: BalanceRow, row: BalanceRow
+) -> str:
+    """What takes most energy in a step by touching or stopping; "": nothing. Collective.
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+        before: Row of the balance table before it.
+        row: That of the step.
+    """
+    losses, system = {"": 0.0}, problem.system
+    touching = problem.elements[: problem.couplings.num_touching]
+    for elements, part in zip(touching, step.parts, strict=False):
         lost = elements.ledger(part, problem.factor).get("contact_defect", 0.0)
-        losses[elements.name] = losses.get(elements.name, 0.0) + lost
-    total = global_sum(problem.system.comm, np.array(list(losses.values())))
-    return list(losses)[int(total.argmax())]
+        name = repr(elements.name)
+        losses[name] = losses.get(name, 0.0) + lost
+    total = dict(zip(losses, global_sum(system.comm, np.array([*losses.values()])), strict=True))
+    if system.declared_joints:
+        of_joints = row["contact_defect" + OF_JOINTS] - before["contact_defect" + OF_JOINTS]
+        names = (f"{joint.name!r}{joint.stops}" for joint in system.declared_joints)
+        total |= zip(names, of_joints, strict=True)
+    return max(total, key=lambda name: total[name])
 
 
 def first_row(system: System, state: State) -> dict[str, Any]:

@@ -136,3 +136,20 @@ def _about_point(total: FloatArray) -> FloatArray:
     """Force, and moment about the mean of the points where a joint holds its body, (n, 2, 3)."""
     force, moment, places, count = total.swapaxes(0, 1)
     return np.stack([force, moment - cross(places / np.maximum(count, 1.0), force)], axis=1)
+
+
+def mean_of_two_steps(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Means of each step and the one before it over their time.
+
+    Args:
+        time: Of the rows [s], shape (rows,).
+        values: Of each row, shape (rows, ...).
+
+    Returns:
+        The same shape. The row of the start and that of the first step are as given.
+    """
+    means, steps = values.copy(), np.diff(time)
+    impulses = values[1:] * steps.reshape(-1, *(1,) * (values.ndim - 1))
+    over = (steps[1:] + steps[:-1]).reshape(-1, *(1,) * (values.ndim - 1))
+    means[2:] = (impulses[1:] + impulses[:-1]) / over
+    return means

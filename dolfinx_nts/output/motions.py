@@ -13,8 +13,12 @@ from dolfinx_nts.joints.cable import Cable
 from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.joints.kinds import Cylindrical, Prismatic, Revolute
 from dolfinx_nts.joints.laws import on_joint
+from dolfinx_nts.ledger.resultants import mean_of_two_steps
 from dolfinx_nts.output.running import Running
 from dolfinx_nts.types import FloatArray
+
+#: Ends of the names of a cable's tensions and of their means.
+_TENSIONS = " tensions", " mean tensions"
 
 
 class Motions:
@@ -23,7 +27,7 @@ class Motions:
         motions = Motions(hinge, slide, spring, rope)
         nts.simulate(..., output=[motions])
         plt.plot(motions.time, motions["hinge"][:, 0])
-        plt.plot(motions.time, motions["rope tensions"][:, 1])  # behind the first eyelet
+        plt.plot(motions.time, motions["rope mean tensions"][:, 1])  # behind the first eyelet
 
     Angles count whole turns while a joint turns by less than half of one from row to row. A run
     that goes on from a checkpoint begins with the turn within half of one to either side.
@@ -50,6 +54,7 @@ class Motions:
         self._rows: list[FloatArray] = []
         #: Columns of the rows by name.
         self._columns: dict[str, slice] = {}
+        self._means: set[str] = set()
 
     def start(self, stepper: Running) -> None:
         """Begin anew with the state the run starts from. Collective."""
@@ -60,12 +65,14 @@ class Motions:
         both = [pair for joint in self.joints for pair in _measured(joint)]
         self._cables = [joint for joint in self.joints if isinstance(joint, Cable)]
         names = [name for name, _ in both]
-        names += [f"{cable.name} tensions" for cable in self._cables]
+        names += [f"{cable.name}{word}" for cable in self._cables for word in _TENSIONS]
         if len(set(names)) < len(names):
             raise ValueError(f"joints: names {names} are not unique; rename a joint")
         widths = [2] * len(both) + [len(cable.friction) + 1 for cable in self._cables]
-        ends = np.cumsum([1, *widths]).tolist()
-        self._columns = dict(zip(names, map(slice, ends, ends[1:]), strict=True))
+        ends = [slice(b - w, b) for w, b in zip(widths, 1 + np.cumsum(widths), strict=True)]
+        self._means = {f"{cable.name}{_TENSIONS[1]}" for cable in self._cables}
+        shown = ends[: len(both)] + [own for own in ends[len(both) :] for _ in _TENSIONS]
+        self._columns = dict(zip(names, shown, strict=True))
         self._of = [
             ([system.bodies.index(body) for body in part.bodies], part.measure) for _, part in both
         ]
@@ -101,14 +108,16 @@ class Motions:
 
         Args:
             name: Of the joint; "NAME way" and "NAME angle" of a cylindrical one; "NAME tensions" of
-                a cable has those of its parts [N], from the first point to the last.
+                a cable has those of its parts [N], from the first point to the last, "NAME mean
+                tensions" their mean over each step and the one before it, which does not alternate.
 
         Raises:
             KeyError: There is no such name.
         """
         if name not in self._columns:
             raise KeyError(f"name={name!r}: no such motion; choose from {list(self._columns)}")
-        return np.array(self._rows)[:, self._columns[name]]
+        found = np.array(self._rows)[:, self._columns[name]]
+        return mean_of_two_steps(self.time, found) if name in self._means else found
 
 
 def _measured(joint: Any) -> Iterator[tuple[str, Any]]:

@@ -166,7 +166,8 @@ def seen(given: Given, colour: Colour) -> Seen:
         return Seen(drawn, joined(sketches), [])
     comm = given.comm
     for joint in given.system.declared_joints:
-        sketch = joint.sketch([body.last_accepted()[0] for body in joint.bodies])
+        u = [body.last_accepted()[0] for body in joint.bodies]
+        sketch = joint.sketch(u, given.time)
         sketches += [sketch, _sticks(joint, sketch.points)]
     there = [m for m in given.obstacles if not given.hides(m)]
     obstacles = [(m, m.displacement(given.time, comm)) for m in there]

@@ -12,7 +12,8 @@ The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run
 - `loads`: of each body the loads and supports that are constant, to tell a restart with others;
 - `last`: start and length of the last step [s], or null;
 - `promised`: largest energies and rounding that the ledger is held against, and kinetic energy at
-  the start of bodies whose motion is prescribed [J];
+  the start of bodies whose motion is prescribed [J]; the largest loss to contact in a step, the end
+  of that step and what took most of it;
 - `measured`: of each body, diagonals of its matrix and factors, from which rounding is judged;
 - `pace`: what `Adapt` remembers, see `PaceMemory`, but its accelerations, which are
   `bodies/K/acceleration`; or null;

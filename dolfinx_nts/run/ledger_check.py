@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -55,15 +56,19 @@ class LedgerCheck:
         # Of bodies whose motion is prescribed: which they are, and their kinetic energy at first.
         self._driven: list[int] | None = None
         self._first = 0.0
+        # Largest loss in a step [J], the end of that [s], and what took most of it.
+        self._jerk = 0.0, 0.0, ""
 
     @property
-    def memory(self) -> tuple[float, float, float, float]:
-        """Largest energies, rounding and energy of driven bodies [J], for a run that goes on."""
-        return self._largest, self._whole, self._rounding, self._first
+    def memory(self) -> tuple[float, float, float, float, tuple[float, float, str]]:
+        """Largest energies, rounding, energy of driven bodies [J]; the step that lost most."""
+        return self._largest, self._whole, self._rounding, self._first, self._jerk
 
-    def resume(self, memory: Sequence[float]) -> None:
+    def resume(self, memory: Sequence[Any]) -> None:
         """Go on from another run's memory."""
-        self._largest, self._whole, self._rounding, self._first = memory
+        self._largest, self._whole, self._rounding, self._first, jerk = memory
+        loss, time, where = jerk
+        self._jerk = loss, time, where
 
     @staticmethod
     def motions(problem: StepProblem, step: Evaluation) -> Asking[FloatArray]:
@@ -169,11 +174,14 @@ class LedgerCheck:
             "meet at an inner edge, declare a contact for each"
         )
         nodes = bool(self._solution.system.contacts)
-        who = f"{'nodes' if nodes else 'joints at their limits'} that touch or leave in mid step"
+        now = row["massless_defect"] - before["massless_defect"] - gain
+        if now > self._jerk[0]:
+            self._jerk = now, row["time"], balance.largest_loss(problem, step, before, row)
         if not nodes and gain > _GAIN * energy + self._rounding:
             kind, text = "energy from limits of joints", (
-                f"{who} bring an energy of {gain:.3g} into a scene of {before['energy']:.3g}; "
-                "use a smaller dt, in which nothing turns through a cone or past a limit"
+                "joints at their limits that touch or leave in mid step bring an energy of "
+                f"{gain:.3g} into a scene of {before['energy']:.3g}; use a smaller dt, in "
+                "which nothing turns through a cone or past a limit"
             )
         elif gain > _GAIN * energy + self._rounding:
             where = balance.expelled(problem, step)
@@ -189,16 +197,23 @@ class LedgerCheck:
         else:
             # What a coefficient of restitution takes is asked for.
             asked, lost = row["impact_restored"] != 0.0, -total - massless
-            if not asked and lost > _LOSS * self._largest + self._rounding:
-                worst = balance.largest_loss(problem, step)
-                most = f", in this step most at {worst!r}" if worst else ""
+            enough = lost > _LOSS * self._largest + self._rounding
+            if not asked and enough and now > self._rounding:
+                system, (most, when, where) = self._solution.system, self._jerk
+                joints = any(joint.stops for joint in system.joints)
+                who = "limits and cables" if joints else "" if nodes else "joints"
+                who = ", ".join(["nodes"] * nodes + [who] * bool(who))
+                moved = any(x.driven for x in (*system.contacts, *system.joints, *system.bodies))
+                restored = "impact='restored' with EnergyMomentum or Midpoint"
                 self._solution.warn(
                     "energy lost to contact", row["time"], lost,
-                    f"{who} have taken an energy of {lost:.3g}, "
-                    f"{self._part(lost):.2g} of the largest energy{most}: how bodies rebound may "
-                    "depend on it; compare with a smaller dt (with Adapt a smaller tolerance)"
-                    f"{' and, where bodies are meshes, a finer one' * nodes}, or pass "
-                    "impact='restored' with EnergyMomentum or Midpoint",
+                    f"{who} that begin or cease to act in mid step took an energy "
+                    f"of {lost:.3g}, "
+                    f"{self._part(lost):.2g} of the largest energy, the most in the step to "
+                    f"t={when:.6g}: {most:.3g}{f', by {where}' * bool(where)}; how bodies rebound "
+                    "may depend on it; compare with a smaller dt (with Adapt a smaller tolerance)"
+                    f"{' and, where bodies are meshes, a finer one' * nodes}"
+                    f"{'' if moved else f', or pass {restored}'}",
                 )  # fmt: skip
             return
         self._solution.warn(kind, row["time"], gain, text, grave=True)

@@ -224,11 +224,7 @@ class Record:
         given = np.asarray(values, dtype=float)
         if len(given) != len(self.rows):
             raise ValueError(f"values of {len(given)} rows: pass one for each of {len(self.rows)}")
-        means, steps = given.copy(), np.diff(self.rows.column("time"))
-        impulses = given[1:] * steps.reshape(-1, *(1,) * (given.ndim - 1))
-        over = (steps[1:] + steps[:-1]).reshape(-1, *(1,) * (given.ndim - 1))
-        means[2:] = (impulses[1:] + impulses[:-1]) / over
-        return means
+        return resultants.mean_of_two_steps(self.rows.column("time"), given)
 
     @property
     def summary(self) -> str:

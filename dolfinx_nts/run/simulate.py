@@ -415,7 +415,9 @@ def _stop(
     """Keep in the status why a run ended, and log it, or what is told, where it is known best."""
     _end(stepper.solution, reason)
     if stepper.system.comm.rank == 0 or cause is not None:
-        logger.warning("%s", told or reason, exc_info=cause)
+        logger.warning("%s", told or reason)
+    if cause is not None:
+        logger.debug("where it was raised", exc_info=cause)
 
 
 def _end(solution: Solution, reason: str) -> None:

@@ -14,6 +14,7 @@ from dolfinx_nts import petsc_compat
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.elements import NO_DIRECTION
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.solve.accuracy import EXACT, Newton
 from dolfinx_nts.solve.convergence import leaves_work, worst
@@ -374,7 +375,7 @@ class StepSolver:
             if self._upright.gives_up:
                 why = self._upright.describe_shortened()
         message = slides + diagnosis(problem, e, self.iterates.flips, why, iterations)
-        advises |= bool(slides) or UNSETTLED in message
+        advises |= bool(slides) or any(word in message for word in (UNSETTLED, NO_DIRECTION))
         return self.with_flat(message, e, advises=advises)
 
     def with_flat(self, message: str, e: Evaluation, *, advises: bool = False) -> StepFailedError:

@@ -1,4 +1,4 @@
-"""Springs and dampers too fast for the steps of a run."""
+"""Springs, dampers and motors too fast for the steps of a run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NOISE = 1e-10
 
 
 class _Fast(NamedTuple):
-    """A spring that may be too fast.
+    """A spring, or a motor that acts as one, that may be too fast.
 
     Attributes:
         limit: Largest of what it can be times the step, over what counts as resolved.
@@ -45,7 +45,7 @@ class _Fast(NamedTuple):
 
 
 def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
-    """The spring that is too fast by most for a step, if there is any. Collective.
+    """The spring or motor that is too fast by most for a step, if there is any. Collective.
 
     It is judged alone, by its `slopes` at the start and by the mass that it moves along its
     coordinate in bodies and joints. On flexible bodies, also behind joints, none is: the mass that
@@ -55,7 +55,9 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
         How many times it is too fast, and a sentence with a remedy.
     """
     each = zip(problem.system.joints, problem.system.joint_bodies, state.joints, strict=True)
-    slopes = [joint.slopes([state.u[k] for k in of], history) for joint, of, history in each]
+    slopes = [
+        joint.slopes([state.u[k] for k in of], history, state.time) for joint, of, history in each
+    ]
     if not any(slopes):
         return None
     still = tuple(np.zeros_like(v) for v in state.v)
@@ -120,7 +122,7 @@ def _sizes(slopes: Slopes, mobility: float, dt: float) -> tuple[float, float]:
 
 def _of_spring(fast: _Fast, mobility: float, size: float, dt: float) -> str:
     return (
-        f"spring {fast.joint.name!r} of stiffness {fast.slopes.stiffness:.3g} on "
+        f"{fast.joint.name!r} of stiffness {fast.slopes.stiffness:.3g} on "
         f"{_mass(fast.slopes, mobility)} is not resolved, omega h = {_PHASE * size:.3g}: where it "
         "vibrates, it does so too slowly, though energy may be kept; use a dt below "
         f"{dt / size:.2g} if that matters"
@@ -169,7 +171,7 @@ class DamperWatch:
             if decay > (found[0] if found else 1.0):
                 name = problem.system.joints[k].name
                 found = decay, (
-                    f"damper {name!r} of {slopes.damping:.3g} on {_mass(slopes, mobility)} is not "
+                    f"{name!r} of damping {slopes.damping:.3g} on {_mass(slopes, mobility)} is not "
                     f"resolved, c h/m = {_DECAY * decay:.3g}: the velocity changes its sign in "
                     f"each step where it should be gone; use a dt below {problem.dt / decay:.2g}"
                 )
@@ -193,7 +195,7 @@ class DamperWatch:
         """Of joint k; None: it holds. Collective."""
         system = self._problem.system
         u = [state.u[b] for b in system.joint_bodies[k]]
-        return system.joints[k].slopes(u, state.joints[k])
+        return system.joints[k].slopes(u, state.joints[k], state.time)
 
     def _motions(self, state: State) -> list[list[float]]:
         """Rates of dampers' coordinates, and what these may be at most, by joint. Collective."""

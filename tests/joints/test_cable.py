@@ -116,6 +116,17 @@ def test_a_slack_cable_stops_a_weight_as_a_limit_does(rule):
     assert lost[-1] > 0.1 and lost == pytest.approx(other.balance["contact_defect"], abs=1e-10)
 
 
+def test_tensions_of_a_cable_that_has_become_taut_alternate_about_the_weight():
+    """Their mean over two steps is the weight."""
+    _, cable, system = hung(length=WAY + 0.03)
+    motions = Motions(cable)
+    nts.simulate(system, nts.EnergyMomentum(), dt=0.007, t_end=0.6, output=[motions])
+    hangs = slice(-10, None)
+    assert np.ptp(motions["rope tensions"][hangs]) > G
+    assert motions["rope mean tensions"][hangs] == pytest.approx(3.0 * G, rel=1e-9)
+    assert motions["rope mean tensions"].shape == motions["rope tensions"].shape
+
+
 @rules
 @pytest.mark.parametrize("mu", [0.05, 0.3, 1.5])
 @pytest.mark.fast("0.3-energy-momentum")
@@ -231,6 +242,16 @@ PINS = {
     1: [(0.0, 0, 0)],
     3: [(2.0, 0, 0.3), (1.0, 0.4, 0), (0.0, 0, 0.2)],
 }
+
+
+def test_a_weight_that_a_winch_pulls_into_an_eyelet():
+    """After 0.5 s nothing is left to pull at, and the run says so, not what is usual."""
+    load, _, system = hung(length=lambda t: WAY - 2.0 * t)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=1.0)
+    assert run.balance["time"][-1] == pytest.approx(0.5, rel=1e-3)
+    assert abs(load.position[2]) < 1e-3 * WAY
+    assert "part 2 of 'rope' has shrunk to length 0" in run.status
+    assert "let its winch (length=) stop" in run.status and "cells" not in run.status
 
 
 @pytest.mark.parametrize("number", PINS)

@@ -272,6 +272,22 @@ def test_a_motor_is_not_asked_about_an_iterate_that_runs_off():
     assert asked == [(0.5, 3.0)]
 
 
+def test_a_motor_that_raises_is_told_with_time_and_line(caplog):
+    """Of the step in whose middle it does; the traceback is for those who ask for it."""
+
+    def motor(t, angle, rate):
+        return 1.0 / (t < 0.5)
+
+    line = motor.__code__.co_firstlineno + 1
+    _, system = disc(0.0, motor=motor)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.1, t_end=1.0)
+    assert run.balance["time"][-1] == pytest.approx(0.5, rel=1e-12)
+    assert run.status.startswith("motor of 'hinge' at t=0.55: ")
+    assert f"raised ZeroDivisionError('float division by zero'), line {line} of" in run.status
+    told = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert told and not any(record.exc_info for record in told)
+
+
 @pytest.mark.fast_on_ranks()
 def test_a_motor_does_work():
     """A constant torque on a disc: w = T t/I, and its work is the energy."""
@@ -382,7 +398,8 @@ def test_laws_that_let_go_ask_for_another_integrator(rule):
     ("laws", "error", "text"),
     [
         ({"friction": 0.3}, TypeError, r"friction=0\.3: pass nts\.JointFriction"),
-        ({"limits": (0.2, 0.5)}, ValueError, r"limits=\(0\.2, 0\.5\): pass the smallest"),
+        ({"limits": (0.2, 0.5)}, ValueError, r"limits=\(0\.2, 0\.5\): .* count from the start"),
+        ({"limits": (None, 0.5)}, ValueError, r"limits=\(None, 0\.5\): .*-math\.inf or math\.inf"),
         (
             {"limits": (-1.0, 0.2), "angle": lambda t: t}, ValueError,
             r"limits=\(-1\.0, 0\.2\) of 'hinge': its motion is prescribed",
@@ -539,6 +556,32 @@ def test_friction_of_a_pin_takes_the_reaction_of_its_step(reach):
     pin = nts.JointFriction(coefficient=reach * ARM / 0.05, radius=0.05)
     errors = [abs(swings(pin, start, 10 * n, 3 * n)[0][-1] - exact) for n in (4, 8)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("part", [0.9, 1.1])
+def test_friction_of_a_pin_takes_the_load_of_a_cable_that_alternates(part):
+    """A weight has become taut at a mast, whose pin carries 30 kg g; a torque acts from then on.
+
+    Up to mu r times that it sticks; beyond it the mast and the weight on its rail turn by t^2/2.
+    """
+    mast = nts.RigidBody.from_inertia(10.0, (2, 2, 2), centre=(0, 0, 0), name="mast")
+    load = nts.RigidBody.from_inertia(20.0, (0.2, 0.2, 0.2), centre=(1, 0, -1), name="load")
+    bound = 0.1 * 0.1 * 30.0 * G
+    pin = nts.Revolute(
+        mast, None, point=(0, 0, 0), axis=(0, 0, 1), name="pin",
+        friction=nts.JointFriction(coefficient=0.1, radius=0.1),
+        motor=lambda t, angle, rate: part * bound * (t > 0.5),
+    )  # fmt: skip
+    rail = nts.Prismatic(load, mast, point=(1, 0, -1), axis=(0, 0, 1))
+    rope = nts.Cable([(mast, (1, 0, 0)), (load, (1, 0, -1))], length=1.02)
+    system = nts.System([mast, load], joints=[pin, rail, rope], gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.8)
+    assert run.status == "completed" and "ledger" not in run.warnings
+    assert np.ptp(run.reactions["pin"][-10:, 0, 2]) > 10.0 * G
+    turned = np.arcsin(mast.rotation[1, 0])
+    turn = 0.5 * 0.3**2 * max(part - 1.0, 0.0) * bound / (2.0 + 0.2 + 20.0)
+    # The pull that turns the weight about adds to the load.
+    assert turned == pytest.approx(turn, rel=1e-5, abs=1e-9 * 0.3**2)
 
 
 def test_friction_of_a_rail_by_what_it_carries():

@@ -942,3 +942,11 @@ def test_joints_that_hang():
     assert least_norm.hanging([(0, 1), (1, 2)], free) == [True, True]
     assert least_norm.hanging([(0, 9), (1, 9), (9,)], free) == [True, True, False]
     assert least_norm.hanging([(0, 1), (0, 1)], free) == [False, False]
+
+
+def test_a_system_and_its_joints_are_described_in_a_line():
+    arm = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="arm")
+    hinge = nts.Revolute(arm, None, point=(0, 0, 0), axis=(0, 0, 1), limits=(-1, 1), name="hinge")
+    assert repr(arm) == "<RigidBody 'arm'>" and repr(hinge) == "<Revolute 'hinge' of 'arm'>"
+    system = nts.System([arm], joints=[hinge])
+    assert repr(system) == "<System of bodies 'arm'; joints 'hinge', 'hinge limits'>"

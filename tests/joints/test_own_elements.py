@@ -99,7 +99,7 @@ class Spring(nts.Joint):
         moved = [side.nodal(values) for side, values in zip(self._sides, u, strict=True)]
         return np.concatenate(moved, axis=1)
 
-    def slopes(self, u, history):
+    def slopes(self, u, history, when=None):
         """For the warning of steps that do not resolve it."""
         x = self._elements(None).reference() + self._gathered(u)
         weight = self._elements(None).weights
@@ -292,7 +292,7 @@ class Silent:
     def __getattr__(self, name):
         return getattr(self._joint, name)
 
-    def slopes(self, u, history):
+    def slopes(self, u, history, when=None):
         return None
 
 

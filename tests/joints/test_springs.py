@@ -604,6 +604,28 @@ def test_a_spring_that_steps_do_not_resolve_is_told():
 
 
 @pytest.mark.mpi
+def test_a_motor_that_steps_do_not_resolve_is_told():
+    """As the spring and the damper that it is: omega h and c h/m where a run starts."""
+
+    def told_of(torque, **options):
+        arm = nts.RigidBody.from_inertia(2, (1, 1, 1), centre=(0, 0, 0), angular_velocity=(0, 0, 1))
+        motor = nts.Revolute(arm, None, point=(0, 0, 0), axis=Z, motor=torque, name="hinge")
+        return told([motor], arm, **options)
+
+    worst, text = told_of(lambda t, a, r: -2e4 * (a - 0.5))
+    assert worst == pytest.approx(1e-2 * np.sqrt(2e4), rel=1e-6)
+    assert text.startswith("'hinge motor' of stiffness 2e+04 on an inertia of 1 is not resolved")
+    assert told_of(lambda t, a, r: -0.99e4 * a + t) == (0.0, "")
+    assert told_of(lambda t, a, r: 2e4 * a) == (0.0, "")
+    worst, text = told_of(lambda t, a, r: -1e4 * r, steps=2)
+    assert worst == pytest.approx(50.0, rel=1e-6) and "c h/m = 100" in text
+    rod = nts.RigidBody.from_inertia(2.0, (1, 1, 1), centre=(1, 0, 0))
+    ends = [(1, 0, 0), (0, 0, 0)]
+    thrust = nts.Thrust(rod, None, ends, force=lambda t, x, r: -4e4 * (x - 1.0), name="cylinder")
+    assert told([thrust], rod)[0] == pytest.approx(1e-2 * np.sqrt(2e4), rel=1e-6)
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.Newmark()], ids=["em", "newmark"])
 def test_a_damper_that_steps_do_not_resolve_is_told(rule):
     """At c h/m = 100 a step keeps 96 % of the velocity, turned round, where nothing should be."""

@@ -82,6 +82,17 @@ def test_what_springs_joints_and_cables_show_moves_with_the_bodies(spinning):
     assert cross.axes[:, 1] == pytest.approx(np.array([(1.0, 0.0, 0.0), arm]), abs=1e-12)
 
 
+@pytest.mark.parametrize(("first", "drawn"), [(2.1, 8 / 15), (2.0, 1.0)])
+def test_a_cable_is_dashed_while_it_is_slack(first, drawn):
+    """Of 15 pieces 8 are drawn, while a winch takes in 2.5 mm."""
+    body = nts.RigidBody.from_inertia(1.0, (1.0, 1.0, 1.0), (0.0, 0.0, -2.0))
+    rope = nts.Cable([(None, (0, 0, 0)), (body, (0, 0, -2))], length=lambda t: first - 0.25 * t)
+    run = nts.simulate(nts.System([body], joints=[rope]), nts.Midpoint(), dt=0.01, t_end=0.01)
+    lines = seen(Given.of("scene", run), "speed").sketch.lines[:, :, 2]
+    found = np.ptp(lines, axis=1).sum()
+    assert found == pytest.approx(-body.position[2] * drawn, rel=1e-12)
+
+
 def test_rigid_bodies_without_a_mesh_are_lines_to_their_joints(spinning, tmp_path):
     system, now = spinning
     one, rod, _ = system.bodies

@@ -825,7 +825,7 @@ def test_other_files_are_refused(mpi_tmp_path):
     COMM.barrier()
     for path, kind, said in (
         (text, OSError, "cannot be read"), (other, ValueError, "it is no checkpoint"),
-        (newer, ValueError, "version 99, and this package reads version 9"),
+        (newer, ValueError, "version 99, and this package reads version 10"),
     ):  # fmt: skip
         with pytest.raises(kind, match=said):
             nts.restart(path, system)
@@ -946,7 +946,7 @@ def test_the_file_is_as_described(mpi_tmp_path):
         energy = list(notes["columns"]).index("energy")
         assert all(shape == [] for shape in list(notes["columns"].values())[: energy + 1])
         assert np.array_equal(file["balance/table"][:, energy], saved.balance["energy"])
-        assert file.attrs["version"] == 9
+        assert file.attrs["version"] == 10
 
 
 # ---- signals

@@ -130,7 +130,27 @@ def test_energy_lost_to_contact(theta):
     if theta == 0.5:
         warning = run.warnings["energy lost to contact"]
         assert warning.worst == pytest.approx(energy, rel=1e-12) and not warning.grave
-        assert f"most at {system.contacts[0].name!r}" in warning.text
+        assert f", by {system.contacts[0].name!r};" in warning.text
+        assert warning.text.startswith("nodes that begin") and "impact='restored'" in warning.text
+
+
+@pytest.mark.parametrize("winch", [False, True])
+def test_energy_lost_to_a_cable(winch):
+    """A weight falls by 0.3 m until its cable is taut, in the step of mean speed d/dt from v."""
+    weight = nts.RigidBody.from_inertia(2.0, (0.01,) * 3, centre=(0, 0, -1))
+    points = [(None, (0, 0, 0)), (weight, (0, 0, -1))]
+    rope = nts.Cable(points, length=(lambda t: 1.3) if winch else 1.3, name="rope")
+    system = nts.System([weight], joints=[rope], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=2.0)
+    warning = run.warnings["energy lost to contact"]
+    assert warning.worst == pytest.approx(2.0 * 9.81 * 0.3, rel=0.01)
+    v, d = 9.81 * 0.24, 0.3 - 0.5 * 9.81 * 0.24**2
+    loss = v**2 - (2.0 * d / 0.01 - v) ** 2 + 2.0 * 9.81 * d
+    assert f"to t=0.25: {loss:.3g}, by 'rope', a cable that became taut" in warning.text
+    assert warning.text.startswith("limits and cables")
+    assert ("impact='restored'" in warning.text) is not winch
+    # Steps that lose nothing more do not count.
+    assert warning.count < 10
 
 
 @pytest.mark.parametrize("low", [0.03, 0.5])

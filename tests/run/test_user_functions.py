@@ -70,7 +70,7 @@ NAMES = {
     "motion": r"^motion of 'floor' at t=0.003",
 }
 FAILURES = {
-    raises: r": <function .* raised KeyError\('table'\); correct it$",
+    raises: r": <function .* raised KeyError\('table'\), line \d+ of test_\w+\.py; correct it$",
     nan: r": returned \(0, 0, nan\); pass three finite components \[[\w^/]+\]$",
     two_numbers: r": returned \(0, 0\); pass three finite components \[[\w^/]+\]$",
 }
@@ -203,7 +203,7 @@ def test_a_body_of_ones_own_whose_numbers_are_none(what, says, monkeypatch):
 
 @pytest.mark.parametrize("what", NAMES)
 def test_at_the_start_it_is_a_bad_argument(what):
-    with pytest.raises(ValueError, match=r"at t=0.0: <function raises.*KeyError\('table'\); corr"):
+    with pytest.raises(ValueError, match=r"at t=0.0: <function raises.*KeyError\('table'\), line"):
         scene(what, raises)
 
 
