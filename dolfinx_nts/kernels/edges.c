@@ -92,11 +92,13 @@ static int apart(const Edges *slave, const Edges *master, const long *pair, doub
 
 /* Of a pair of edges after a part of the way: the gap along their common normal out of the master, whether they meet
  * between their ends and along normals of both, whether the normal is -b' x a' for +, whether a node of the slave is near,
- * over a facet of the master (1), on it (2), or beyond its edge or below (3, 4), which end is beyond that (1, 2), and at
- * which end of the master's edge they meet (1, 2). Ends of edges are their nodes', but on a straight line of the master no
- * node is held. */
+ * over a facet of the master (1), on it (2), or beyond its edge or below (3, 4), which end is beyond that (1, 2), at
+ * which end of the master's edge they meet (1, 2), which ends of the slave's are over facets of the master or on them (1, 2,
+ * 3: both), and which is the nearer to where they meet (1, 2). Ends of edges are their nodes', but on a straight line of
+ * the master no node is held. */
 static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limits, const long *pair, double part,
-                 double *gap, unsigned char *turned, unsigned char *held, unsigned char *beyond, unsigned char *corner)
+                 double *gap, unsigned char *turned, unsigned char *held, unsigned char *beyond, unsigned char *corner,
+                 unsigned char *above, unsigned char *nearer)
 {
     double a[3], b[3], along[3], across[3], way[3], one[2][3], two[2][3];
     of_edge(slave, pair[0], part, a, along, one);
@@ -124,7 +126,8 @@ static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limi
         ends[0][i] = way[i] - along[i];
         ends[1][i] = way[i] + along[i];
     }
-    *held = *beyond = 0;
+    *held = *beyond = *above = 0;
+    *nearer = s > 0.0 ? 2 : 1;
     for (int f = 0; f < 2; f++) {
         double cosine = dot(normal, two[f]);
         meet = meet && cosine < limits->outside && -dot(normal, one[f]) < limits->outside;
@@ -132,6 +135,7 @@ static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limi
             continue;
         int first = over(ends[0], across, two[f], two[1 - f], none), last = over(ends[1], across, two[f], two[1 - f], none);
         int near = s > 0.0 ? last : first;
+        *above |= (first == 1 || first == 2) | (last == 1 || last == 2) << 1;
         if (cosine > -limits->level && fabs(fabs(s) - 1.0) < limits->by_node) {
             if (near == 1 || near == 2)
                 *held = *held < 3 && *held > near ? *held : near;
@@ -148,27 +152,30 @@ static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limi
  * meet at the start, at the end, and where the gap closes on the way, if it does, and at the end what node is near, and
  * which is beyond, and at which end of the master's edge they meet at the start or the end. What is farther apart at the start than the reach does not meet. Of those that meet, which touch, with a
  * gap from -near to limit at the start or one that closes, and which pass each other by more than near; and the numbers of
- * both. */
+ * both. An edge also touches and passes whose end slides off a facet of the master over its rim: at the start it does not
+ * meet that, and its line may be below it. */
 void closest_edges(const Edges *slave, const Edges *master, const EdgeLimits *limits, double reach, double near, double limit,
                    long n, const long *pairs, double *gaps, unsigned char *meet, unsigned char *turned,
                    unsigned char *nodes, unsigned char *touch, long *numbers)
 {
     numbers[0] = numbers[1] = 0;
     for (long p = 0; p < n; p++, pairs += 2, gaps += 2, meet += 3, nodes += 3, touch += 2) {
-        unsigned char other, before[3];
+        unsigned char other, before[3], above, none_above, nearer;
         double none;
         if (apart(slave, master, pairs, reach)) {
             gaps[0] = gaps[1] = INFINITY;
             meet[0] = meet[1] = meet[2] = turned[p] = nodes[0] = nodes[1] = nodes[2] = touch[0] = touch[1] = 0;
             continue;
         }
-        meet[0] = meets(slave, master, limits, pairs, 0.0, gaps, turned + p, before, before + 1, before + 2);
-        meet[1] = meets(slave, master, limits, pairs, 1.0, gaps + 1, &other, nodes, nodes + 1, nodes + 2);
+        meet[0] = meets(slave, master, limits, pairs, 0.0, gaps, turned + p, before, before + 1, before + 2, &above, &nearer);
+        meet[1] = meets(slave, master, limits, pairs, 1.0, gaps + 1, &other, nodes, nodes + 1, nodes + 2, &none_above, &nearer);
         nodes[2] = nodes[2] ? nodes[2] : before[2];
+        int slides_off = meet[1] && !meet[0] && gaps[1] < -near && above & nearer;
         meet[2] = gaps[0] > 0.0 && gaps[1] < 0.0 &&
-                  meets(slave, master, limits, pairs, gaps[0] / (gaps[0] - gaps[1]), &none, &other, before, before + 1, before + 2);
-        touch[0] = ((meet[0] || meet[1]) && gaps[0] > -near && gaps[0] < limit) || meet[2];
-        touch[1] = ((meet[1] && fabs(gaps[0]) <= near) || (meet[2] && gaps[0] > near)) && gaps[1] < -near;
+                  meets(slave, master, limits, pairs, gaps[0] / (gaps[0] - gaps[1]), &none, &other, before, before + 1,
+                        before + 2, &none_above, &nearer);
+        touch[0] = ((meet[0] || meet[1]) && gaps[0] > -near && gaps[0] < limit) || meet[2] || slides_off;
+        touch[1] = (((meet[1] && fabs(gaps[0]) <= near) || (meet[2] && gaps[0] > near)) && gaps[1] < -near) || slides_off;
         numbers[0] += touch[0];
         numbers[1] += touch[1];
     }
