@@ -37,8 +37,8 @@ def check_scheme(system: System, integrator: Any, newton: Any, petsc_options: An
     for joint in system.joints:
         if joint.mid_step and integrator.accelerations:
             raise ValueError(
-                f"integrator={integrator!r}: {joint.name!r} may hold and let go. Accelerations jump "
-                "there, and this integrator takes them from one step to the next; use "
+                f"integrator={integrator!r}: {joint.name!r} may hold and let go. Accelerations "
+                "jump there, and this integrator takes them from one step to the next; use "
                 "EnergyMomentum() or Midpoint()"
             )
     if not isinstance(newton, Newton | None):
