@@ -145,11 +145,14 @@ def with_entries(a: PETSc.Mat, start: IntArray, cols: IntArray, values: FloatArr
     return PETSc.Mat().createAIJ(a.getSizes(), csr=csr, comm=a.comm)
 
 
-def assemble_matrix(a: PETSc.Mat, form: Any, bcs: Sequence[Any], diagonal: float) -> None:
-    """Assemble a bilinear form; rows and columns of bcs hold only the given diagonal."""
+def assemble_matrix(
+    a: PETSc.Mat, form: Any, bcs: Sequence[Any], diagonal: float, *more: Any
+) -> None:
+    """Assemble bilinear forms; rows and columns of bcs hold only the given diagonal."""
     a.zeroEntries()
-    fem_petsc.assemble_matrix(a, form, list(bcs), diagonal)
-    a.assemble()
+    for each in (form, *more):
+        fem_petsc.assemble_matrix(a, each, list(bcs), diagonal)
+        a.assemble()  # else what is added next would take the place of what is there
 
 
 _lib: Any = None

@@ -258,10 +258,14 @@ def items(name: str, value: object, fits: Callable[[Any], bool], wanted: str) ->
 
 
 def _line(error: Exception) -> str:
-    """Where an error was raised, if that is not in this package."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    path = Path(last.filename)
-    return "" if Path(__file__).parent in path.parents else f", line {last.lineno} of {path.name}"
+    """The line of the user's file that led to an error, if there is one."""
+    own = Path(__file__).parent
+    frames = [
+        frame for frame in traceback.extract_tb(error.__traceback__)
+        if own not in Path(frame.filename).parents
+    ]  # fmt: skip
+    lines = [frame.lineno for frame in frames if frame.filename == frames[0].filename]
+    return f", line {lines[-1]} of {Path(frames[0].filename).name}" if lines else ""
 
 
 def call_together(

@@ -104,7 +104,7 @@ tar -C "$repo" -c --exclude=./.git --exclude="./.venv*" --exclude=./out --exclud
   --exclude=__pycache__ --exclude=".*_cache" . | tar -C "$work" -x --no-same-owner
 cache=/root/.cache
 [ -z "${CI:-}" ] || cache=/$work/.jit
-env -i CI="${CI:-}" PYTEST_ARGS="${PYTEST_ARGS:-}" MPI_TIMEOUT="${MPI_TIMEOUT:-}" NO_LINT=1 \
+env -i CI="${CI:-}" PYTEST_ARGS="${PYTEST_ARGS:-}" MPI_TIMEOUT="${MPI_TIMEOUT:-}" TESTS_UNTIL="${TESTS_UNTIL:-}" NO_LINT=1 \
   HOME=/root LANG=C.UTF-8 TERM=dumb PATH=/usr/sbin:/usr/bin:/sbin:/bin XDG_CACHE_HOME="$cache" \
   chroot . /bin/bash -c "cd /$work && scripts/setup.sh && $command"
 '

@@ -5,7 +5,7 @@
 #   test.sh --slow   the tests marked slow, which the fast ones leave out, those on ranks first; those
 #                    that start 3 or 4 ranks of their own one by one, as waiting ranks take a core each
 # A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest ("-n0 --pdb ..." for
-# those that need its terminal, with one process); NO_LINT=1 skips lint.
+# those that need its terminal, with one process); NO_LINT=1 skips lint; TESTS_UNTIL is its --until.
 set -uo pipefail
 . "$(dirname "$0")/common.sh"
 cd "$REPO" || exit 1
@@ -23,6 +23,7 @@ if [ -z "${NO_LINT:-}" ]; then # beside the tests, as most of it waits or takes 
 fi
 clean_environment
 read -r -a args <<<"${PYTEST_ARGS:-}"
+until=(${TESTS_UNTIL:+--until=$TESTS_UNTIL})
 
 # finished STAGE STATUS: pytest's status 5 says that PYTEST_ARGS selected no test of this stage.
 finished() {
@@ -36,7 +37,7 @@ finished() {
 in_serial() {
   local stage="$name tests, serial"
   say "$stage"
-  "$PYTHON" -m pytest -q -n auto --dist loadfile -m "$which and not on_ranks" "${args[@]}" </dev/null
+  "$PYTHON" -m pytest -q -n auto --dist loadfile -m "$which and not on_ranks" "${args[@]}" "${until[@]}" </dev/null
   finished "$stage" $?
 }
 
@@ -44,7 +45,7 @@ on_two_ranks() {
   local stage="$name tests marked mpi, 2 ranks" color=no
   say "$stage"
   [ ! -t 1 ] || color=yes # mpirun gives every rank a terminal, so pytest cannot tell
-  mpi 2 "$PYTHON" -m pytest -q -m "mpi and $which" -p no:cacheprovider --color="$color" "${args[@]}"
+  mpi 2 "$PYTHON" -m pytest -q -m "mpi and $which" -p no:cacheprovider --color="$color" "${args[@]}" "${until[@]}"
   finished "$stage" $?
 }
 
@@ -53,7 +54,7 @@ if [ "$which" = slow ]; then
   on_two_ranks
   stage="tests on 3 and 4 ranks"
   say "$stage"
-  "$PYTHON" -m pytest -q -m on_ranks "${args[@]}" </dev/null
+  "$PYTHON" -m pytest -q -m on_ranks "${args[@]}" "${until[@]}" </dev/null
   finished "$stage" $?
   in_serial
 else

@@ -119,13 +119,15 @@ class Pressure:
     """Pressure on the boundary of a continuum, or on cells of a shell.
 
     It pushes a continuum inwards, and a shell's middle surface from the bottom to the top. One that
-    follows acts along the normal and on the area of the time. On a continuum it is taken at the
-    place where the integrator takes its forces, in the middle of the step or, in equilibrium, at
-    its end; the resultant and the moment of a uniform one all around are none, and its work is p
-    times the change of the volume but for a third-order term. On a shell its force in a step of
-    `EnergyMomentum` is the mean on the way of the step, so that the work of a constant one on a
-    closed shell is p times the change of the volume exactly; its moment on a closed shell, none, is
-    then off by a third-order term, with `Midpoint` it is exact.
+    follows acts along the normal and on the area that the surface has then.
+
+    On a continuum it is taken at the place where the integrator takes its forces: in the middle of
+    the step, in equilibrium at its end. A uniform one all around has neither resultant nor moment,
+    and its work is p times the change of the volume but for a third-order term.
+
+    On a shell its force in a step of `EnergyMomentum` is the mean on the way of the step. So the
+    work of a constant one on a closed shell is p times the change of the volume exactly. Its moment
+    on a closed shell, none, is then off by a third-order term; with `Midpoint` it is exact.
 
     Attributes:
         value: [Pa]: a number, or a function of time.
@@ -146,6 +148,7 @@ class Pressure:
     def __post_init__(self) -> None:
         require_bool("follower", self.follower)
         _check_where("Pressure", self.where)
+        _refuse_ufl("Pressure.value", self.value, "a finite number [Pa], or a function of time")
         if not callable(self.value) and not is_finite(self.value):
             raise ValueError(
                 f"Pressure.value={self.value!r}: must be a finite number [Pa], or a function of "
@@ -163,14 +166,16 @@ def _check_where(name: str, where: Marker) -> None:
 
 
 def _check_value(name: str, value: Any, unit: str, or_else: str) -> None:
-    """Raise unless it is a vector or may be a function; what UFL has can be called, but is none."""
-    if hasattr(value, "ufl_shape"):
-        raise TypeError(
-            f"{name}={value!s}: is of UFL ({type(value).__name__}); pass three finite components "
-            f"[{unit}], or {or_else}"
-        )
+    """Raise unless it is a vector or may be a function."""
+    _refuse_ufl(name, value, f"three finite components [{unit}], or {or_else}")
     if not callable(value):
         vector(name, value, unit, or_else=or_else)
+
+
+def _refuse_ufl(name: str, value: Any, wanted: str) -> None:
+    """Raise TypeError where it is of UFL, which can be called, but is no function."""
+    if hasattr(value, "ufl_shape"):
+        raise TypeError(f"{name}={value!s}: is of UFL ({type(value).__name__}); pass {wanted}")
 
 
 def takes_place(value: Any) -> bool:

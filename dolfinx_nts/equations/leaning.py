@@ -71,7 +71,8 @@ class PressingLoad(NamedTuple):
 
     It tells "load", this rank's part of their sum times the factor of the step, (1,), on the law's
     rank "by_unknowns", the derivative of the sum by each of the unknowns, (n, unknowns), and
-    "normal", a unit vector along which most of it acts as the step begins, (3,).
+    "normal", a unit vector along which most of it acts as the step begins, (3,), and "spread", what
+    acts along the next axis over that, from 0 to 1.
 
     Attributes:
         comm: MPI communicator.
@@ -79,6 +80,7 @@ class PressingLoad(NamedTuple):
         here: Elements of the law on this rank, 0 or 1.
         by_unknowns: Of all ranks, one after the other, shape (unknowns,).
         normal: Shape (3,).
+        spread: See above.
     """
 
     comm: MPI.Comm
@@ -86,6 +88,7 @@ class PressingLoad(NamedTuple):
     here: int
     by_unknowns: FloatArray
     normal: FloatArray
+    spread: float
 
     @classmethod
     def of(
@@ -109,8 +112,9 @@ class PressingLoad(NamedTuple):
         force, normals = rows[:, 1].clip(min=0.0), rows[:, 2:]
         # Where nothing presses yet, all that may touch counts.
         weight = force if force.any() else np.ones(len(rows))
-        _, axes = np.linalg.eigh(np.einsum("n,ni,nj->ij", weight, normals, normals))
-        return cls(comm, tuple(batches), here, rows[:, 0], axes[:, -1])
+        sizes, axes = np.linalg.eigh(np.einsum("n,ni,nj->ij", weight, normals, normals))
+        spread = float(sizes[1] / sizes[2]) if sizes[2] > 0.0 else 0.0
+        return cls(comm, tuple(batches), here, rows[:, 0], axes[:, -1], spread)
 
     def columns(self, elements: Sequence[Any], starts: Sequence[int]) -> IntArray:
         """As of `Load`. Collective."""
@@ -128,4 +132,7 @@ class PressingLoad(NamedTuple):
         sums = [-(elements[k].law.scale @ own[k]["constraints"][:, 0]) for k in self.batches]
         by_unknowns = np.tile(self.by_unknowns, (self.here, 1))
         load = np.array([sum(sums, start=0.0)])
-        return {"load": load, "by_unknowns": by_unknowns, "normal": self.normal}
+        return {
+            "load": load, "by_unknowns": by_unknowns, "normal": self.normal,
+            "spread": np.array(self.spread),
+        }  # fmt: skip

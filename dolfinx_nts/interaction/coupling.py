@@ -33,6 +33,20 @@ class StepWarning(NamedTuple):
     grave: bool = False
 
 
+class Moment(NamedTuple):
+    """When and at what rates a user's function is asked for its slopes.
+
+    Attributes:
+        time: [s].
+        dt: Step that follows [s].
+        v: Owned velocities of each of a joint's bodies [m/s].
+    """
+
+    time: float
+    dt: float
+    v: Sequence[FloatArray]
+
+
 class Slopes(NamedTuple):
     """What a force along a coordinate, a length or an angle, does near a state.
 
@@ -112,7 +126,7 @@ class Joint:
         return 0.0
 
     def slopes(
-        self, u: Sequence[FloatArray], history: Any, when: float | None = None
+        self, u: Sequence[FloatArray], history: Any, when: Moment | None = None
     ) -> Slopes | None:
         """What its force does, if it is one along a coordinate and holds nothing. Collective.
 
@@ -121,7 +135,7 @@ class Joint:
         Args:
             u: As of `potential`.
             history: Likewise.
-            when: Time [s]; None: a user's function of time is not asked and counts as none.
+            when: None: a user's function of time is not asked and counts as none.
 
         Returns:
             None, for all arguments, of a joint that holds.

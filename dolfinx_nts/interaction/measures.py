@@ -78,6 +78,20 @@ class Measure:
         return cls(each[0].kind, sides, *values)
 
 
+class Asked(NamedTuple):
+    """When and at which rates a law is asked for its slopes.
+
+    Attributes:
+        time: [s].
+        rate: Of the measure, shape (n,).
+        dt: Step that follows [s].
+    """
+
+    time: float
+    rate: FloatArray
+    dt: float
+
+
 class Move(NamedTuple):
     """A measure in a step, as laws need it.
 
@@ -116,12 +130,12 @@ class Law(Protocol):
     def pull(self, move: Move) -> tuple[FloatArray, FloatArray]:
         """D, shape (n,), and its derivative by the vectors at t_{n+1}, shape (n, 3 v)."""
 
-    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
+    def slopes(self, at: FloatArray, asked: Asked | None) -> tuple[float, float]:
         """Derivatives of D by the measure and by its rate on this rank. Collective.
 
         Args:
             at: The measure.
-            when: Time [s]; None: of a function of time none are asked for.
+            asked: When and at which rates; None: a user's function of time is not asked.
         """
 
 

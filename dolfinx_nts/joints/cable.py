@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.interaction.coupling import Joint, Slopes
+from dolfinx_nts.interaction.coupling import Joint, Moment, Slopes
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.interaction.sketch import DASHED, STRAIGHT, Sketch, along, moved
@@ -235,7 +235,7 @@ class Cable(Joint):
         return float(Stretched(self.axial_stiffness, free).value(path).sum())
 
     def slopes(
-        self, u: Sequence[FloatArray], history: FloatArray, when: float | None = None
+        self, u: Sequence[FloatArray], history: FloatArray, when: Moment | None = None
     ) -> Slopes | None:
         """Gradient of its path, and its stiffness while taut; None of inextensible. Collective."""
         if self.axial_stiffness is None:

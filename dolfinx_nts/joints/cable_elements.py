@@ -334,9 +334,10 @@ class CableElements(PointElements):
         """Its rows, and how often it became taut or slack, or stuck or slipped."""
         weight, text = super().describe(part, flips)
         text = f"{text}, flips {int(flips.sum())} times" if flips.any() else text
-        parts = Lengths.each(self.measure.vectors(self.y0)).ravel()
+        places = self.measure.reference(), self.y0
+        begun, parts = (Lengths.each(self.measure.vectors(y)).ravel() for y in places)
         k = int(parts.argmin())
-        if parts[k] > _SHORT * parts.sum():
+        if parts[k] > _SHORT * parts.sum() or parts[k] > 0.5 * begun[k]:
             return weight, text
         return weight, (
             f"{text}, part {k + 1} of {self.name!r} has shrunk to length 0, or nearly, and has "

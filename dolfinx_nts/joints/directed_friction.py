@@ -73,6 +73,7 @@ class DirectedPart(NamedTuple):
         memory: D, and the vectors where the slip began, shape (n, m + 3 v), or (n, m + 3 v + c)
             with the memory of `Carried`.
         work: Of D against the motion of the step [J], shape (n,).
+        spread: Of a law that depends on a contact, that of `PressingLoad`.
     """
 
     residual: FloatArray
@@ -80,6 +81,7 @@ class DirectedPart(NamedTuple):
     status: BoolArray
     memory: FloatArray
     work: FloatArray
+    spread: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.interaction.coupling import Slopes
+from dolfinx_nts.interaction.coupling import Moment, Slopes
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measured
-from dolfinx_nts.interaction.measures import Measure, Move, columns, holds
+from dolfinx_nts.interaction.measures import Asked, Measure, Move, columns, holds
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.interaction.sketch import STRAIGHT, Shape, Sketch, along, moved
 from dolfinx_nts.joints.between import OfTwo, points_of, require_directions
@@ -97,7 +97,7 @@ class AlongMeasure(OfTwo):
         return y, measure.kind.value(measure.vectors(y), history[:, 0])
 
     def slopes(
-        self, u: Sequence[FloatArray], history: FloatArray, when: float | None = None
+        self, u: Sequence[FloatArray], history: FloatArray, when: Moment | None = None
     ) -> Slopes | None:
         """Gradient of the measure, and derivatives of the force; None if it holds. Collective.
 
@@ -116,7 +116,12 @@ class AlongMeasure(OfTwo):
         for side in measure.sides:
             here = slice(first, first := first + side.nodes.shape[1])
             gradients.append(side.gathered(along[:, here]))
-        stiffness, damping = self.comm.allreduce(np.array(self.law.slopes(at, when))).tolist()
+        asked = None
+        if when is not None:
+            local = sum(float(g @ v) for g, v in zip(gradients, when.v, strict=True))
+            rate = np.full_like(at, self.comm.allreduce(local))
+            asked = Asked(when.time, rate, when.dt)
+        stiffness, damping = self.comm.allreduce(np.array(self.law.slopes(at, asked))).tolist()
         return Slopes(gradients, stiffness, damping, measure.kind is kernel.Angle)
 
     def coupling(self, bodies: tuple[int, ...]) -> Measured:
@@ -274,7 +279,7 @@ class Stiff:
         mean, change = self._ask(self._energy.quotient, *move.ends)
         return mean, move.share * change[:, None] * move.gradient.end
 
-    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
+    def slopes(self, at: FloatArray, asked: Asked | None) -> tuple[float, float]:
         """V'' and none. Collective."""
         _, change = self._ask(self._energy.quotient, at, at)
         return 2.0 * float(change.sum()), 0.0
@@ -316,7 +321,7 @@ class Viscous(NamedTuple):
         by_end = bend + move.rate * gradient.mean
         return self.damping * rate, np.reshape(self.damping, (-1, 1)) * by_end
 
-    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
+    def slopes(self, at: FloatArray, asked: Asked | None) -> tuple[float, float]:
         """None and c."""
         return 0.0, self.damping * len(at)
 

@@ -13,11 +13,12 @@ import numpy as np
 
 from dolfinx_nts.interaction.carried import no_memory
 from dolfinx_nts.interaction.measured import leans
-from dolfinx_nts.interaction.measures import Move, Row, columns
+from dolfinx_nts.interaction.measures import Asked, Move, Row, columns
 from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.types import BoolArray, FloatArray
 from dolfinx_nts.validation import (
+    UserFunctionError,
     call_together,
     direction,
     is_finite,
@@ -36,6 +37,8 @@ _NARROW = 5e-3
 TIE = 1e-9
 #: Part of a measure or a rate by which a motor is asked for its slopes.
 _APART = float(np.finfo(float).eps) ** (1 / 3)
+#: Part of a slope by which two such may differ of a function that is smooth there.
+_SMOOTH = 0.1
 
 
 @known_options
@@ -213,19 +216,28 @@ class Driven:
         by_end: Any = by_at[:, None] * to_at + by_rate[:, None] * to_rate
         return -torque, -by_end
 
-    def slopes(self, at: FloatArray, when: float | None) -> tuple[float, float]:
-        """At rest there. Collective."""
-        if when is None:
+    def slopes(self, at: FloatArray, asked: Asked | None) -> tuple[float, float]:
+        """Of a function that is smooth there; else, or where it raises, none. Collective."""
+        if asked is None:
             return 0.0, 0.0
-        _, by_at, by_rate = self._asked(when, at, np.zeros_like(at), self._unit)
-        return -float(by_at.sum()), -float(by_rate.sum())
+        least = self._unit / asked.dt
+        try:
+            (_, *one), (_, *two) = (
+                self._asked(asked.time, at, asked.rate, least, apart)
+                for apart in (_APART, 2.0 * _APART)
+            )
+        except UserFunctionError:
+            return 0.0, 0.0
+        # That of a jump falls with the distance at which it is asked.
+        same = [np.abs(a - b) <= _SMOOTH * np.abs(a) for a, b in zip(one, two, strict=True)]
+        stiffness, damping = (-float(a[k].sum()) for a, k in zip(one, same, strict=True))
+        return stiffness, damping
 
     def _asked(
-        self, when: float, at: FloatArray, rate: FloatArray, least: float
+        self, when: float, at: FloatArray, rate: FloatArray, least: float, apart: float = _APART
     ) -> tuple[FloatArray, ...]:
-        """T and its derivatives, of rates that count from this on. Collective."""
-        step = _APART * (np.abs(at) + self._unit)
-        fast = _APART * (np.abs(rate) + least)
+        """T and its derivatives, of rates that count from `least` on. Collective."""
+        step, fast = apart * (np.abs(at) + self._unit), apart * (np.abs(rate) + least)
         torque, more, less, ahead, behind = self._ask(
             when, np.array([at, at + step, at - step, at, at]),
             np.array([rate, rate, rate, rate + fast, rate - fast]),

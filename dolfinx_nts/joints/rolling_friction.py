@@ -5,13 +5,14 @@ Each has its own bound, a length times the sum of the contact's normal forces (t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
 from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.measures import Measure
 from dolfinx_nts.joints.between import OfTwo
 from dolfinx_nts.joints.directed_friction import (
@@ -25,6 +26,9 @@ from dolfinx_nts.kernels.vectors import triad
 from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import is_finite, known_options, require_same
+
+#: Part of the forces along a second axis from which on a run warns that there is no one normal.
+_UNCLEAR = 0.3
 
 
 class _Rolls(Turn):
@@ -62,13 +66,27 @@ class _RollingElements(DirectedElements):
         forms = np.einsum("nak,nkvw->navw", turned, self.forms)
         arms = np.tile(self.law, (len(x), 1))
         slopes = arms[:, :, None] * (load > 0.0) * own["by_unknowns"][:, None]
-        return self._obeyed(x, own["constraints"], forms, arms * load / self.step.factor, slopes)
+        part = self._obeyed(x, own["constraints"], forms, arms * load / self.step.factor, slopes)
+        return part._replace(spread=float(own["spread"]))
 
 
 class _RollingCoupling(DirectedCoupling):
     """Makes `_RollingElements`."""
 
     _of: ClassVar[type[DirectedElements]] = _RollingElements
+
+    def warnings(self, parts: Sequence[DirectedPart]) -> list[StepWarning]:
+        """That a contact presses in several directions, between which rounding may choose."""
+        spread = max((part.spread for part in parts), default=0.0)
+        if spread < _UNCLEAR:
+            return []
+        pair = self._joint.pressed_by.name
+        text = (
+            f"contact {pair!r} presses in several directions, along a second one by {spread:.2g} "
+            f"of the first: {self._joint.name!r} tells rolling from spinning by one normal; "
+            "declare a contact for each face, with a RollingFriction of its own"
+        )
+        return [StepWarning("several normals", spread, text, (self._joint.name,))]
 
 
 @known_options

@@ -87,9 +87,15 @@ class ContactLoads(NamedTuple):
 
 
 def labels(system: System) -> list[str]:
-    """Names of the contacts for fields: those of the same name are numbered."""
+    """Names of the contacts for fields, all different: those of the same name are numbered."""
     names = [re.sub(r"^\.+|[^\w.-]+", "_", pair.name) for pair in system.contacts]
-    return [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
+    found = []
+    for k, name in enumerate(names):
+        label = name if names.count(name) == 1 else f"{name}_{k}"
+        while label != name and label in names:
+            label += "_"
+        found.append(label)
+    return found
 
 
 def at_nodes(

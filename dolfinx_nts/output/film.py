@@ -174,7 +174,8 @@ def _loads(
     """What this rank's nodes give the vertices of their cells of contact forces. Collective.
 
     Nodes of degree 2 between vertices carry most of a pressure, or all of it; each hands its force
-    to those around it as a linear function does, which keeps sums and moments.
+    to those around it as a linear function does. That keeps sums, and moments where edges are
+    straight.
 
     Args:
         stepper: The run.

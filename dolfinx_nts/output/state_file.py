@@ -1,6 +1,6 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 9, with h5py's names of types:
+Version 10, with h5py's names of types:
 
 - attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (10) and
   `package` (the version that wrote it);

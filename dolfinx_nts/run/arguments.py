@@ -37,8 +37,9 @@ def check_scheme(system: System, integrator: Any, newton: Any, petsc_options: An
     for joint in system.joints:
         if joint.mid_step and integrator.accelerations:
             raise ValueError(
-                f"integrator={integrator!r}: {joint.name!r} may hold and let go, and accelerations "
-                "that a method carries do not jump with it; use EnergyMomentum() or Midpoint()"
+                f"integrator={integrator!r}: {joint.name!r} may hold and let go. Accelerations "
+                "jump there, and this integrator takes them from one step to the next; use "
+                "EnergyMomentum() or Midpoint()"
             )
     if not isinstance(newton, Newton | None):
         raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")

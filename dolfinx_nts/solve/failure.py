@@ -108,10 +108,11 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
         return ""
     first = int(found[0])
     names = " and ".join(sorted({repr(name) for of in ranks for k, name in of if k == first}))
-    return (
-        f"friction is used up (all nodes of {names} slip: |F_t| = mu F_n, and friction can carry "
-        f"no more load): body {system.bodies[first].name!r} slides; use simulate, or hold it; "
-    )
+    how = f"friction of {names} carries more than {_USED_UP:.0%} of what it can"
+    if not stick[first]:
+        how = f"all nodes of {names} slip: |F_t| = mu F_n, and friction can carry no more load"
+    name = system.bodies[first].name
+    return f"friction is used up ({how}): body {name!r} slides; use simulate, or hold it; "
 
 
 def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: int) -> str:

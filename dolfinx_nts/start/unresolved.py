@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
-from dolfinx_nts.interaction.coupling import Slopes
+from dolfinx_nts.interaction.coupling import Moment, Slopes
 from dolfinx_nts.interaction.kinematics import has_constraints
 from dolfinx_nts.interaction.measured import Measured
 from dolfinx_nts.parallel import global_sum
@@ -54,10 +54,7 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
     Returns:
         How many times it is too fast, and a sentence with a remedy.
     """
-    each = zip(problem.system.joints, problem.system.joint_bodies, state.joints, strict=True)
-    slopes = [
-        joint.slopes([state.u[k] for k in of], history, state.time) for joint, of, history in each
-    ]
+    slopes = [_slopes(problem, k, state, dt) for k in range(len(problem.system.joints))]
     if not any(slopes):
         return None
     still = tuple(np.zeros_like(v) for v in state.v)
@@ -72,6 +69,13 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
         if size > worst:
             worst, text = size, _of_spring(fast, mobility, size, dt)
     return (worst, text) if text else None
+
+
+def _slopes(problem: StepProblem, k: int, state: State, dt: float) -> Slopes | None:
+    """Of joint k; None: it holds. Collective."""
+    of = problem.system.joint_bodies[k]
+    u, v = ([values[b] for b in of] for values in (state.u, state.v))
+    return problem.system.joints[k].slopes(u, state.joints[k], Moment(state.time, dt, v))
 
 
 def _suspects(
@@ -162,7 +166,7 @@ class DamperWatch:
             rates[:] = [*rates[-2:], ways[k]]
             if not (_alternate(rates) and max(map(abs, rates)) * problem.dt > _NOISE * sizes[k]):
                 continue
-            slopes = self._slopes(k, state)
+            slopes: Any = _slopes(problem, k, state, problem.dt)
             gradient = [np.zeros(body.num_owned) for body in problem.system.bodies]
             for body, g in zip(problem.system.joint_bodies[k], slopes.gradients, strict=True):
                 gradient[body] = g
@@ -182,7 +186,7 @@ class DamperWatch:
         problem, found = self._problem, []
         system, state = problem.system, problem.state
         for k, of in enumerate(system.joint_bodies):
-            slopes = self._slopes(k, state)
+            slopes = _slopes(problem, k, state, problem.dt)
             if slopes is None or not slopes.damping > 0.0:
                 continue
             if all(system.bodies[b].rigid for b in _joined(problem, of)):
@@ -190,12 +194,6 @@ class DamperWatch:
         self._rates = {k: [] for k in found}
         ways, _ = self._motions(state)
         return {k: [ways[k]] for k in found}
-
-    def _slopes(self, k: int, state: State) -> Any:
-        """Of joint k; None: it holds. Collective."""
-        system = self._problem.system
-        u = [state.u[b] for b in system.joint_bodies[k]]
-        return system.joints[k].slopes(u, state.joints[k], state.time)
 
     def _motions(self, state: State) -> list[list[float]]:
         """Rates of dampers' coordinates, and what these may be at most, by joint. Collective."""
@@ -208,8 +206,8 @@ class DamperWatch:
                 local[:, numbers] = coupling.motions(state)
                 continue
             for k in sorted(watched.keys() & set(numbers)):
-                gradients = self._slopes(k, state).gradients
-                for b, g in zip(system.joint_bodies[k], gradients, strict=True):
+                slopes: Any = _slopes(self._problem, k, state, self._problem.dt)
+                for b, g in zip(system.joint_bodies[k], slopes.gradients, strict=True):
                     place = np.abs(system.bodies[b].reference + state.u[b]).max(initial=0.0)
                     local[:, k] += [g @ state.v[b], np.abs(g).sum() * place]
         return global_sum(system.comm, local).tolist()

@@ -23,6 +23,9 @@ def test_a_name_that_is_given_is_used_everywhere(mpi_tmp_path):
     assert [pair.name for pair in pairs] == ["lid", "seal-wall", "seal-wall"]
     assert labels(system) == ["lid", "seal-wall_1", "seal-wall_2"]
     assert "'lid'" in repr(pairs[0])
+    # A name that is that of a numbered one.
+    taken = [nts.ContactPair(faces[0], walls[0], name="seal-wall_2"), *pairs[1:]]
+    assert len(set(labels(nts.System([body], contacts=taken)))) == 3
     path = mpi_tmp_path / "forces.csv"
     nts.simulate(
         system, nts.EnergyMomentum(), dt=1e-3, t_end=1e-3, output=[ForcesCSV(path)], progress=False

@@ -37,7 +37,7 @@ class Stiffens(NamedTuple):
         by_b = 0.5 * self.k + 0.25 * self.q * (a**2 + b**2 + 2.0 * b * (a + b))
         return force, (move.share * by_b)[:, None] * move.gradient.end
 
-    def slopes(self, at, when):
+    def slopes(self, at, asked):
         return float((self.k + 3.0 * self.q * (at - self.length) ** 2).sum()), 0.0
 
 

@@ -326,7 +326,7 @@ def test_tangent_is_the_derivative_of_the_element(rule, load):
         told = {
             "load": (by_unknowns * z[:, size + m :]).sum(keepdims=True)[0],
             "constraints": z[:, size : size + m], "by_unknowns": by_unknowns,
-            "normal": np.array([0.6, 0.0, 0.8]),
+            "spread": np.array(0.0), "normal": np.array([0.6, 0.0, 0.8]),
         }  # fmt: skip
         (part,) = together(
             MPI.COMM_SELF, [batch.evaluate(z[:, :size].reshape(x.shape), told)]
@@ -341,6 +341,24 @@ def test_tangent_is_the_derivative_of_the_element(rule, load):
         expected = differences(lambda y: evaluated(y).residual, z, 1e-6)
         assert np.abs(found.tangent[:, : size + m] - expected).max() < 1e-6 * np.abs(expected).max()
     stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
+@pytest.mark.parametrize("radius, told", [(0.8, True), (2.0, False)])
+def test_a_contact_without_one_normal_is_told(radius, told):
+    """A cube lies in a hollow cylinder on two edges, with normals 2 asin(1/2r) apart."""
+    mesh = box((-0.5, -0.5, 0), (0.5, 0.5, 1), (1, 1, 1), CellType.hexahedron, COMM)
+    body = nts.RigidBody(mesh, density=1e3, name="cube")
+    hollow = nts.Cylinder((0, 0, np.sqrt(radius**2 - 0.25)), (0, 1, 0), radius, inside=True)
+    pair = nts.ContactPair(at(body, 0.0), hollow)
+    law = nts.RollingFriction(pair, rolling=1e-3)
+    system = nts.System([body], contacts=[pair], joints=[law], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=5e-3, progress=False)
+    assert ("several normals" in run.warnings) is told
+    if told:
+        spread = 0.25 / (radius**2 - 0.25)
+        assert run.warnings["several normals"].worst == pytest.approx(spread, rel=1e-3)
 
 
 @pytest.mark.parametrize(

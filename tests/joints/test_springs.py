@@ -619,6 +619,9 @@ def test_a_motor_that_steps_do_not_resolve_is_told():
     assert told_of(lambda t, a, r: 2e4 * a) == (0.0, "")
     worst, text = told_of(lambda t, a, r: -1e4 * r, steps=2)
     assert worst == pytest.approx(50.0, rel=1e-6) and "c h/m = 100" in text
+    # A jump has no slope, and a function that divides by its rate is asked at that of the arm.
+    assert told_of(lambda t, a, r: 1.0 if a < 0.0 else -1.0) == (0.0, "")
+    assert told_of(lambda t, a, r: 0.5 / r, steps=2) == (0.0, "")
     rod = nts.RigidBody.from_inertia(2.0, (1, 1, 1), centre=(1, 0, 0))
     ends = [(1, 0, 0), (0, 0, 0)]
     thrust = nts.Thrust(rod, None, ends, force=lambda t, x, r: -4e4 * (x - 1.0), name="cylinder")

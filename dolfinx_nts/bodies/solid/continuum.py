@@ -307,11 +307,19 @@ class Continuum(UflBody):
     @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
-        loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
+        loads = {"body_force": self.body_force, "traction": self._load_settings}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
         own["viscosity"] = self.viscosity
         own |= {"volume": self._volume, "bending": self._modes is not None}
         return own | loads | super().settings
+
+    @property
+    def _load_settings(self) -> list[Any]:
+        """Of each traction its value, and of a pressure whether it follows."""
+        return [
+            (load.value, load.follower) if isinstance(load, Pressure) else load.value
+            for load in self._traction
+        ]
 
     def stress_jumps(self) -> FloatArray:
         """As of `Body`."""

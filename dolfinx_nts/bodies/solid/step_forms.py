@@ -85,6 +85,8 @@ class _Compiled(NamedTuple):
         extra: Extra virtual work, if there is any.
         power: What a viscosity takes [W], if there is any.
         cells: What is within cells, if there is anything.
+        following: Virtual work of loads that follow and its tangent, if there are such. One form
+            takes tags of one set alone, and `extra` may have others.
     """
 
     work: Any
@@ -92,6 +94,7 @@ class _Compiled(NamedTuple):
     extra: Any
     power: Any
     cells: WithinCells | None
+    following: list[Any]
 
 
 class StepForms:
@@ -109,6 +112,7 @@ class StepForms:
         viscous: Virtual work of a viscosity in UFL, linear in v and w: (u, v, w) -> form of the
             place and the velocity where forces are taken; None: there is none.
         check_alive: Raises an error once the body was destroyed.
+        following: Virtual work of loads that follow the body, as `extra`.
     """
 
     def __init__(
@@ -119,8 +123,9 @@ class StepForms:
         extra: ExtraForm | None,
         viscous: Callable[[Any, Any, Any], Any] | None,
         check_alive: Callable[[], None],
+        following: ExtraForm | None = None,
     ) -> None:
-        self._check_alive = check_alive
+        self._check_alive, self._loads = check_alive, following
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
         self._viscous = viscous
         self._forms: dict[Integrator, _Compiled] = {}
@@ -142,7 +147,8 @@ class StepForms:
     def begin(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
         forms = self._compiled(rule)
-        self._work, self._tangent, self._extra_work, self._power, self._cells = forms
+        self._work, self._tangent, self._extra_work, self._power, self._cells, following = forms
+        self._following, self._turning = following[:1], following[1:]
         if self._matrix is None:
             self._matrix = petsc_compat.create_matrix(self._tangent)
         fill(self._u0, moment.u0)
@@ -159,11 +165,12 @@ class StepForms:
         return self.assemble(self._work)
 
     def extra(self, u1: FloatArray) -> FloatArray | float:
-        """Forces of the extra virtual work [N]."""
-        if self._extra_work is None:
+        """Forces of the extra virtual work and of loads that follow [N]."""
+        own = [] if self._extra_work is None else [self._extra_work]
+        if not (own or self._following):
             return 0.0
         fill(self._u1, u1)
-        return self.assemble(self._extra_work)
+        return np.sum([self.assemble(form) for form in own + self._following], axis=0)
 
     def power(self, u1: FloatArray) -> float:
         """What a viscosity takes where the step takes its forces, this rank's part [W]."""
@@ -186,7 +193,9 @@ class StepForms:
         """
         self._move_to(u1)
         self._factors.value = mass, stiffness
-        petsc_compat.assemble_matrix(self._matrix, self._tangent, masks, diagonal)
+        petsc_compat.assemble_matrix(
+            self._matrix, self._tangent, masks, diagonal, *self._turning
+        )
         if self._cells is not None:
             self._cells.add_to(self._matrix, stiffness, masks)
         return self._matrix
@@ -217,7 +226,7 @@ class StepForms:
 
     def forces(self, rule: Integrator, u0: FloatArray, u1: FloatArray) -> FloatArray:
         """Internal forces by a rule between two places of rest [N]; set the state anew after it."""
-        work, *_, cells = self._compiled(rule)
+        work, *_, cells, _ = self._compiled(rule)
         self._rate.value = 0.0
         fill(self._u0, u0)
         fill(self._u1, u1)
@@ -228,7 +237,7 @@ class StepForms:
 
     def stiffness_at_rest(self) -> FloatArray:
         """Diagonal of the tangent in equilibrium, without deformation [N/m]."""
-        _, tangent, *_, cells = self._compiled(EQUILIBRIUM)
+        _, tangent, *_, cells, _ = self._compiled(EQUILIBRIUM)
         kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
         for u in (self._u0, self._u1):
             u.x.array[:] = 0.0
@@ -302,7 +311,14 @@ class StepForms:
             of_extra, of_power = (
                 None if form is None else compile_forms([form])[0] for form in (extra, power)
             )
-            self._forms[rule] = _Compiled((own or [cells])[0], made, of_extra, of_power, cells)
+            following = []
+            if self._loads is not None:
+                load = self._loads(place, velocity, w, self._time)
+                turning = self._factors[1] * ufl.derivative(load, self._u1, du)
+                following = compile_forms([load, turning])
+            self._forms[rule] = _Compiled(
+                (own or [cells])[0], made, of_extra, of_power, cells, following
+            )
         return self._forms[rule]
 
 

@@ -91,11 +91,9 @@ class UflBody(MeshBody):
         self._determinants: Determinants | None = None
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
-        extra = [form for form in (extra_form, following) if form is not None]
         self._forms = StepForms(
-            space, self._virtual_work, self._mass_form,
-            (lambda *given: sum(form(*given) for form in extra)) if extra else None,
-            viscous, self.check_alive,
+            space, self._virtual_work, self._mass_form, extra_form, viscous, self.check_alive,
+            following,
         )  # fmt: skip
 
     # ---- what a kind of body has of its own
