@@ -93,9 +93,9 @@ static int apart(const Edges *slave, const Edges *master, const long *pair, doub
 /* Of a pair of edges after a part of the way: the gap along their common normal out of the master, whether they meet
  * between their ends and along normals of both, whether the normal is -b' x a' for +, whether a node of the slave is near,
  * over a facet of the master (1), on it (2), or beyond its edge or below (3, 4), which end is beyond that (1, 2), at
- * which end of the master's edge they meet (1, 2), which ends of the slave's are over facets of the master or on them (1, 2,
- * 3: both), and which is the nearer to where they meet (1, 2). Ends of edges are their nodes', but on a straight line of
- * the master no node is held. */
+ * which end of the master's edge they meet (1, 2). Of the slave's edge and of the master's, which ends are over facets of
+ * the other one or on them (1, 2, 3: both), and which is the nearer to where they meet (1, 2). Ends of edges are their
+ * nodes', but on a straight line of the master no node is held. */
 static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limits, const long *pair, double part,
                  double *gap, unsigned char *turned, unsigned char *held, unsigned char *beyond, unsigned char *corner,
                  unsigned char *above, unsigned char *nearer)
@@ -126,8 +126,9 @@ static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limi
         ends[0][i] = way[i] - along[i];
         ends[1][i] = way[i] + along[i];
     }
-    *held = *beyond = *above = 0;
-    *nearer = s > 0.0 ? 2 : 1;
+    *held = *beyond = above[0] = above[1] = 0;
+    nearer[0] = s > 0.0 ? 2 : 1;
+    nearer[1] = t > 0.0 ? 2 : 1;
     for (int f = 0; f < 2; f++) {
         double cosine = dot(normal, two[f]);
         meet = meet && cosine < limits->outside && -dot(normal, one[f]) < limits->outside;
@@ -135,7 +136,7 @@ static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limi
             continue;
         int first = over(ends[0], across, two[f], two[1 - f], none), last = over(ends[1], across, two[f], two[1 - f], none);
         int near = s > 0.0 ? last : first;
-        *above |= (first == 1 || first == 2) | (last == 1 || last == 2) << 1;
+        above[0] |= (first == 1 || first == 2) | (last == 1 || last == 2) << 1;
         if (cosine > -limits->level && fabs(fabs(s) - 1.0) < limits->by_node) {
             if (near == 1 || near == 2)
                 *held = *held < 3 && *held > near ? *held : near;
@@ -144,6 +145,16 @@ static int meets(const Edges *slave, const Edges *master, const EdgeLimits *limi
         }
         if (first == 0 || last == 0)
             *beyond = first ? 2 : 1;
+    }
+    for (int i = 0; i < 3; i++) {
+        ends[0][i] = -way[i] - across[i];
+        ends[1][i] = -way[i] + across[i];
+    }
+    for (int f = 0; f < 2; f++) {
+        if (-dot(normal, one[f]) < -limits->steep || !slave->of_surface[2 * pair[0] + f])
+            continue;
+        int first = over(ends[0], along, one[f], one[1 - f], none), last = over(ends[1], along, one[f], one[1 - f], none);
+        above[1] |= (first == 1 || first == 2) | (last == 1 || last == 2) << 1;
     }
     return meet;
 }
@@ -160,20 +171,20 @@ void closest_edges(const Edges *slave, const Edges *master, const EdgeLimits *li
 {
     numbers[0] = numbers[1] = 0;
     for (long p = 0; p < n; p++, pairs += 2, gaps += 2, meet += 3, nodes += 3, touch += 2) {
-        unsigned char other, before[3], above, none_above, nearer;
+        unsigned char other, before[3], above[2], later[2], nearer[2];
         double none;
         if (apart(slave, master, pairs, reach)) {
             gaps[0] = gaps[1] = INFINITY;
             meet[0] = meet[1] = meet[2] = turned[p] = nodes[0] = nodes[1] = nodes[2] = touch[0] = touch[1] = 0;
             continue;
         }
-        meet[0] = meets(slave, master, limits, pairs, 0.0, gaps, turned + p, before, before + 1, before + 2, &above, &nearer);
-        meet[1] = meets(slave, master, limits, pairs, 1.0, gaps + 1, &other, nodes, nodes + 1, nodes + 2, &none_above, &nearer);
+        meet[0] = meets(slave, master, limits, pairs, 0.0, gaps, turned + p, before, before + 1, before + 2, above, nearer);
+        meet[1] = meets(slave, master, limits, pairs, 1.0, gaps + 1, &other, nodes, nodes + 1, nodes + 2, later, nearer);
         nodes[2] = nodes[2] ? nodes[2] : before[2];
-        int slides_off = meet[1] && !meet[0] && gaps[1] < -near && above & nearer;
+        int slides_off = meet[1] && !meet[0] && gaps[1] < -near && ((above[0] & nearer[0]) || (above[1] & nearer[1]));
         meet[2] = gaps[0] > 0.0 && gaps[1] < 0.0 &&
                   meets(slave, master, limits, pairs, gaps[0] / (gaps[0] - gaps[1]), &none, &other, before, before + 1,
-                        before + 2, &none_above, &nearer);
+                        before + 2, later, nearer);
         touch[0] = ((meet[0] || meet[1]) && gaps[0] > -near && gaps[0] < limit) || meet[2] || slides_off;
         touch[1] = (((meet[1] && fabs(gaps[0]) <= near) || (meet[2] && gaps[0] > near)) && gaps[1] < -near) || slides_off;
         numbers[0] += touch[0];
