@@ -319,6 +319,11 @@ def laws_on(
         both = measure[2] * np.array(_both(names[1], limits))
         found.append((names[1], Limits(*both.tolist()), ("contact_defect", 1.0)))
     if motor is not None:
+        if joint.motion is not None:
+            raise ValueError(
+                f"{names[2]}={motor!r} of {joint.name!r}: its motion is prescribed, which no motor "
+                "changes; drop one of them"
+            )
         driven = driven_by(joint, names[2], motor, 1.0 if turns else joint.length)
         found.append((names[2], driven, ("external_work", -1.0)))
     return tuple(

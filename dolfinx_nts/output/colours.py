@@ -156,7 +156,8 @@ class Scale(NamedTuple):
 def scale_of(values: FloatArray, colour: Colour, limits: Any, units: str) -> Scale:
     """The scale of values: between given limits, or percentiles, which one peak does not move.
 
-    Of contact pressure the peak is what is asked for: from zero to the largest.
+    That of stress begins at zero. Of contact pressure the peak is asked for: from zero to the
+    largest.
 
     Zeros, as of stress before an impact or of pressure beside a contact, are no part of the
     percentiles, but in the scale. It is symmetric where there are values of both signs.
@@ -177,8 +178,8 @@ def scale_of(values: FloatArray, colour: Colour, limits: Any, units: str) -> Sca
     low, high = np.percentile(there, _ENDS).tolist() if len(there) else (0.0, 0.0)
     if len(there) < len(values):
         low, high = min(low, 0.0), max(high, 0.0)
-    if colour == "pressure":
-        low, high = 0.0, float(values.max())
+    if colour in ("stress", "pressure"):
+        low, high = 0.0, high if colour == "stress" else float(values.max())
     signed = low < 0.0 < high
     if signed:
         low, high = min(low, -high), max(high, -low)

@@ -404,6 +404,10 @@ def test_laws_that_let_go_ask_for_another_integrator(rule):
             {"limits": (-1.0, 0.2), "angle": lambda t: t}, ValueError,
             r"limits=\(-1\.0, 0\.2\) of 'hinge': its motion is prescribed",
         ),
+        (
+            {"motor": lambda t, a, w: 1.0, "angle": lambda t: t}, ValueError,
+            "of 'hinge': its motion is prescribed, which no motor changes",
+        ),
         ({"limits": 1.0}, ValueError, r"limits=1\.0: pass the smallest"),
         ({"motor": 2.0}, TypeError, r"motor=2\.0: pass a function of time"),
     ],

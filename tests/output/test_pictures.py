@@ -177,8 +177,10 @@ def test_one_peak_does_not_set_the_scale():
     values = np.random.default_rng(3).uniform(1.0, 2.0, 1000)
     values[7] = 1e6
     low, high = np.percentile(values, [2.0, 98.0])
-    scale = scale_of(values, "stress", None, "m")
+    scale = scale_of(values, "speed", None, "m")
     assert scale.limits == pytest.approx((low, high)) and scale.extend == "both"
+    scale = scale_of(values, "stress", None, "m")
+    assert scale.limits == pytest.approx((0.0, high)) and scale.extend == "max"
     # Zeros are none of the values, but in the scale, and NaN is nothing.
     more = np.concatenate([values, np.zeros(5000), np.full(10, np.nan)])
     assert scale_of(more, "stress", None, "m").limits == pytest.approx((0.0, high))
