@@ -16,6 +16,8 @@ _CLEAR = 3
 _NEAR = 0.8
 #: ... the next one's width is this part of its width.
 _SHARPER = 0.03
+#: Slip over the extent of the bodies that is rounding: none slips, and a width of it leads nowhere.
+_ROUNDED = 16 * float(np.finfo(float).eps)
 #: A joint slips that slips by more widths than this, and keeps this part of its slip as the width
 #: falls.
 _WIDTHS, _KEPT = 3.0, 0.5
@@ -74,9 +76,11 @@ class RubbingJoints:
             changes = [(a.status != b.status).any() for a, b in zip(before, parts, strict=True)]
             if not anywhere(comm, any(changes)):
                 return new, False
-            largest = float(global_max(comm, np.abs(slip).max(initial=0.0, keepdims=True))[0])
+            extents = np.concatenate([batch.extents for batch in batches])
+            local = [np.abs(a).max(initial=0.0) for a in (slip, extents)]
+            largest, extent = global_max(comm, np.array(local)).tolist()
             self._changes += 1
-            if self._changes <= _CLEAR or not 0.0 < largest < np.inf:
+            if self._changes <= _CLEAR or not _ROUNDED * extent < largest < np.inf:
                 return new, False
             self._width = _SHARPER * self._width or largest
             self._blurs, self._slip, self._ways = True, None, None

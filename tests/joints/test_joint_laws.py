@@ -1,5 +1,7 @@
 """Friction, limits and motors of joints against closed forms; see theory section 22."""
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -11,6 +13,7 @@ from scipy.optimize import brentq, lsq_linear
 
 import dolfinx_nts as nts
 from dolfinx_nts.interaction.measured import Measured
+from dolfinx_nts.solve.rubbing_joints import RubbingJoints
 
 COMM = MPI.COMM_WORLD
 G = 9.81
@@ -649,4 +652,29 @@ def test_the_tangent_knows_the_load_of_a_pin():
     expected = differences(lambda y: np.array([residual(z)[-1] for z in y]), x[None], 1e-6)[0]
     assert np.count_nonzero(np.abs(found) > 1e-9 * np.abs(found).max()) > 1
     assert relative(found, expected) < 1e-8
+    stepper.close()
+
+
+@pytest.mark.parametrize("slip, blurs", [(1e-17, False), (1e-9, True)])
+def test_friction_is_not_blurred_by_slip_that_is_rounding(slip, blurs):
+    """Of a joint at rest that sticks and slips in turns: a width of rounding leads nowhere."""
+    _, system = pendulum(friction=nts.JointFriction(bound=2.0 * MASS * G * ARM))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    stepper.advance(1e-3)
+    problem = stepper.problem
+    problem.begin(stepper.state, 1e-3)
+    rubbing, e = RubbingJoints(problem), problem.evaluate(problem.x)
+    rubbing.restart()
+    (k,) = (k for k, batch in enumerate(problem.elements) if batch.name == "hinge friction")
+
+    def iterate(sticks):
+        part, batch = e.parts[k], problem.elements[k]
+        memory = part.memory.copy()
+        memory[:, 0] = batch.since + slip / batch.measure.length
+        parts = list(e.parts)
+        parts[k] = part._replace(status=np.full_like(part.status, sticks), memory=memory)
+        return replace(e, parts=parts)
+
+    led = [rubbing.at(iterate(n % 2), iterate(1 - n % 2), problem.x)[1] for n in range(6)]
+    assert any(led) is blurs
     stepper.close()
