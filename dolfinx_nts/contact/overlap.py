@@ -186,15 +186,15 @@ class OverlapWatch:
             borne = sum(c.borne(histories[n]) for n, c in self._corners if c.of is contact)
             if not carry.any():
                 continue
-            positions = contact.positions([u[b] for b in bodies])
+            where = [u[b] for b in bodies]
+            positions = contact.positions(where)
             if k not in self._edges:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
             rim = inside_rim(contact, positions, carry, held, borne)
-            if rim and k in self._along:
-                # Edges that cross will carry at the rim as soon as the body has tipped so far.
-                where = [u[b] for b in bodies]
-                rim = None if self._along[k].meets(where, FLAT, carry > 0.0) else rim
+            # Edges that cross will carry at the rim as soon as the body has tipped so far.
+            if rim and k in self._along and self._along[k].meets(where, FLAT, carry > 0.0):
+                rim = None
             inner = in_inner_edge(self._edges[k], contact, positions, everywhere[k])
             yield from filter(None, (rim, inner))
 

@@ -149,7 +149,7 @@ def test_energy_lost_to_a_cable(winch):
     assert f"to t=0.25: {loss:.3g}, by 'rope', a cable that became taut" in warning.text
     assert warning.text.startswith("limits and cables")
     assert ("impact='restored'" in warning.text) is not winch
-    # Steps that lose nothing more do not count.
+    # The 175 steps in which it hangs from there on lose nothing more, and do not count.
     assert warning.count < 10
 
 
