@@ -264,8 +264,7 @@ class System:
         """
         found = values[: len(self.contacts)].copy()
         # Corners are those of masters.
-        for k, value in zip(self.contact_of[len(found) :], values[len(found) :], strict=True):
-            found[k] -= value
+        np.subtract.at(found, np.array(self.contact_of[len(found) :], int), values[len(found) :])
         return found
 
     def slave_area(self, k: int, state: State) -> FloatArray:

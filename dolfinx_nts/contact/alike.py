@@ -15,6 +15,8 @@ import numpy as np
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
 from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.obstacle_gap import ObstacleGap
+from dolfinx_nts.contact.obstacles import can_join
 from dolfinx_nts.types import FloatArray
 
 
@@ -93,13 +95,19 @@ def _kind(batch: Any) -> Any:
     if getattr(type(batch), "evaluate", None) is not ContactElements.evaluate:
         return None
     law, measure = batch.law, batch.measure
-    if type(measure) is not FacetGap or law.varies is not None:
+    if type(measure) not in (FacetGap, ObstacleGap) or law.varies is not None:
         return None
+    # Obstacles move by themselves: only contacts with the same one may be alike.
+    master = None
+    if type(measure) is ObstacleGap:
+        master = id(batch.pair.master)
+        if not can_join(measure.obstacle):
+            return None
     if not all(body.rigid for body in batch.pair.bodies):
         return None
     return (
         law.friction, law.row, law.num_normal, law.rubs, law.imposed is None,
-        batch.num_coordinates, batch.attachment.weights is None,
+        batch.num_coordinates, batch.attachment.weights is None, master,
     )  # fmt: skip
 
 
@@ -122,7 +130,7 @@ def _group(numbers: list[int], batches: list[Any], known: _Group | None) -> _Gro
     extents = np.array([batch.pair.extent for batch in batches])
     together = replace(
         first, attachment=placed, law=law, offset=np.concatenate(offsets),
-        measure=FacetGap.joined([batch.measure for batch in batches], counts),
+        measure=first.measure.joined([batch.measure for batch in batches], counts),
         contacts=(extents, np.repeat(np.arange(len(counts)), counts)),
     )  # fmt: skip
     return _Group(batches, numbers, counts, together)

@@ -22,6 +22,7 @@ from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
+from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -76,6 +77,7 @@ class ContactSearch:
         self._had: Sequence[BoolArray] | None = None
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
         shares, before = [pair.slave.share for pair in contacts], held_before(contacts)
+        self._none: list[BoolArray] = [np.zeros(len(share), dtype=bool) for share in shares]
         self._foreign = [held[here] for held, here in zip(before, shares, strict=True)]
         both = zip(meeting(contacts, before), shares, strict=True)
         self._meets = [meets[here] for meets, here in both]
@@ -85,8 +87,9 @@ class ContactSearch:
         """Which of this rank's slave nodes had unknowns in the last step, of each contact."""
         if self._had is not None:
             return list(self._had)
-        found = [np.zeros(len(pair.slave.share), dtype=bool) for pair in self._pairs]
+        found = list(self._none)
         for k, c in zip(self.numbers, self.elements, strict=True):
+            found[k] = self._none[k].copy()
             found[k][c.candidates.node] = True
         return found
 
@@ -110,8 +113,7 @@ class ContactSearch:
         time = step.state.time
         if search:
             self._apart.look(step.state.u, step.motion)
-            of = [*range(self._declared), *(of for _, of in self._corners)]
-            self._sought = [k for k, pair in enumerate(of) if pair not in self._apart.far]
+            self._sought = [k for k in range(len(self._pairs)) if k not in self._apart.far]
         self._paths = {k: self._pairs[k].path(time, time + step.dt) for k in self._sought}
         if again is None:
             self._aimed: dict[int, IntArray] = {}
@@ -181,13 +183,35 @@ class ContactSearch:
         on = global_max(self._comm, np.array([float(a.any()) for a in self._with_unknowns])) > 0.0
         return set().union(*itertools.compress(self.bodies, on))
 
+    def _placed_at(
+        self, numbers: Sequence[int], u: Sequence[FloatArray]
+    ) -> dict[int, Sequence[FloatArray]]:
+        """Positions of all points of contacts [m], see `ContactPair.positions`. Collective.
+
+        Args:
+            numbers: Of the contacts.
+            u: Owned displacements of all bodies [m].
+        """
+        # What corners touch lies where their pair's surfaces do.
+        first = self._declared
+        pair_of = {k: k if k < first else self._corners[k - first][1] for k in numbers}
+        of: dict[int, tuple[Surface, FloatArray]] = {}
+        for k in pair_of.values():
+            both = zip(self._pairs[k].surfaces, self._of[k], strict=True)
+            of.update((id(surface), (surface, u[b])) for surface, b in both)
+        moved = gather_each(*zip(*of.values(), strict=True)) if of else []
+        ways, found = dict(zip(of, moved, strict=True)), dict[int, Sequence[FloatArray]]()
+        for k, own in pair_of.items():
+            if own not in found:
+                pair = self._pairs[own]
+                found[own] = pair.placed([ways[id(surface)] for surface in pair.surfaces])
+            found[k] = found[own] if k == own else found[own][::-1]
+        return found
+
     def _positions(self, k: int) -> Sequence[FloatArray]:
-        """Positions of all points of a contact at t_n [m], see `ContactPair`. Collective."""
-        if k not in self._placed and k >= self._declared:
-            # What corners touch lies where their pair's surfaces do.
-            self._placed[k] = self._positions(self._corners[k - self._declared][1])[::-1]
-        elif k not in self._placed:
-            self._placed[k] = self._pairs[k].positions([self._step.state.u[b] for b in self._of[k]])
+        """Positions of all points of a contact that is sought, at t_n [m]. Collective."""
+        if not self._placed:
+            self._placed = self._placed_at(self._sought, self._step.state.u)
         return self._placed[k]
 
     def _reach(self, k: int, motion: FloatArray) -> float:
@@ -272,7 +296,8 @@ class ContactSearch:
         node, reach = c.candidates.node, self._reach(k, self._step.motion)
         force = self._old[k].force[node]
         if c.law.strong:
-            closes = self._gap(k, c, self._step.first) < -_SURELY * reach
+            first = self._placed_at([k], self._step.first)[k]
+            closes = c.gap_at(first, self._paths[k][1]) < -_SURELY * reach
             return closes | (force > no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step, and rounding of
         # gaps must not decide which of the nodes that rest carry forces.
@@ -444,9 +469,7 @@ class ContactSearch:
     def _gaps(
         self, elements: Sequence[ContactElements], u: Sequence[FloatArray]
     ) -> list[FloatArray]:
-        return [self._gap(k, c, u) for k, c in zip(self.numbers, elements, strict=True)]
-
-    def _gap(self, k: int, c: ContactElements, u: Sequence[FloatArray]) -> FloatArray:
-        """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
-        moved = c.pair.positions([u[b] for b in self._of[k]])
-        return c.gap_at(moved, self._paths[k][1])
+        """Gaps of candidates of each contact at displacements of all bodies [m]. Collective."""
+        placed = self._placed_at(self.numbers, u)
+        both = zip(self.numbers, elements, strict=True)
+        return [c.gap_at(placed[k], self._paths[k][1]) for k, c in both]

@@ -149,10 +149,6 @@ class FacetPair(ContactPair, master=Surface):
         depth: FloatArray = self.master.depth(self.slave.positions(u[0]), u[1])
         return depth
 
-    def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-        """Positions of all points of both surfaces [m], (p, 3) each, as of `ContactPair`."""
-        return self._moved((self.slave, self.master), u)
-
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
         control = self.master.control_points(positions[1], found.patch)

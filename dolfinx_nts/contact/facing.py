@@ -83,7 +83,7 @@ class Facing:
 
     def __init__(self, slave: Surface, master: Surface, edges: ConvexEdges) -> None:
         self._slave, self._master, self._edges = slave, master, edges
-        self._normals: _Normals | None = None
+        self._placed: tuple[FloatArray, FloatArray] | None = None
 
     def look(self, slaves: FloatArray, corners: FloatArray) -> None:
         """Note where the facets are.
@@ -92,26 +92,35 @@ class Facing:
             slaves: Points of the slave [m].
             corners: Corners of the master's facets [m].
         """
-        if not len(self._slave.facets) or not self._edges.sharp.any():
-            return
-        around, other = self._around, middles(corners)[1]
+        if len(self._slave.facets) and self._edges.sharp.any():
+            self._placed = slaves, corners
+            # All ranks make it, though few may ask.
+            self._around  # noqa: B018
+            vars(self).pop("_normals", None)
+
+    @property
+    def all(self) -> bool:
+        """Whether all that is near faces the nodes."""
+        return self._placed is None
+
+    @cached_property
+    def _normals(self) -> _Normals:
+        """Normals where the facets are; most looks find nothing near, and none asks for them."""
+        assert self._placed is not None
+        (slaves, corners), around = self._placed, self._around
+        other = middles(corners)[1]
         own = np.concatenate([middles(slaves[self._slave.facets])[1], around.beyond(slaves)])
         # The tip of a needle has facets that face nothing ahead of it, but their mean does.
         mean = np.zeros_like(slaves)
         np.add.at(mean, around.points, own[around.rows])
         mean = mean[self._slave.share]
         mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
-        self._normals = _Normals(own, mean, other)
-
-    @property
-    def all(self) -> bool:
-        """Whether all that is near faces the nodes."""
-        return self._normals is None
+        return _Normals(own, mean, other)
 
     def faces(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Which facets, -1 none, face the rank's slaves, shape (n,)."""
         found = np.ones(len(node), dtype=bool)
-        if self._normals is not None:
+        if not self.all:
             some = np.flatnonzero(facet >= 0)
             found[some] = self._oppose(self._normals, node[some], facet[some])
         return found
@@ -136,7 +145,7 @@ class Facing:
         The facet beyond does not face the node.
         """
         ends = np.zeros((len(node), self._master.facets.shape[1]), dtype=bool)
-        if self._normals is None:
+        if self.all:
             return ends
         beside, joined = self._edges.beside[facet], self._edges.joined[facet]
         some, edge = np.nonzero((beside >= 0) & (joined < 0))

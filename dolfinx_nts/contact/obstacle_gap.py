@@ -6,13 +6,15 @@ here; only the balance learns of its work.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
-from dolfinx_nts.contact.obstacles import Obstacle, inverse
+from dolfinx_nts.contact.obstacles import Obstacle, inverse, joined
 from dolfinx_nts.contact.surface_sums import Sums
 from dolfinx_nts.kernels import compiled, compiled_law
 from dolfinx_nts.kernels.vectors import cross
@@ -43,6 +45,12 @@ class ObstacleGap(Batch):
     theta: float
     num_augmented = 0
     num_normal = 1
+
+    @classmethod
+    def joined(cls, batches: Sequence[Any], counts: Sequence[int]) -> Any:
+        """As of `Batch`, of one obstacle about the origins of several contacts."""
+        obstacle = joined([batch.obstacle for batch in batches], counts)
+        return replace(super().joined(batches, counts), obstacle=obstacle)
 
     @property
     def extent(self) -> float:

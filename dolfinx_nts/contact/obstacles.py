@@ -200,14 +200,14 @@ class Plane(Obstacle):
         self._check()
 
     @property
-    def _height(self) -> float:
-        """Height of the surface above the origin [m]."""
-        return float(np.dot(self.point, self.normal))
+    def _height(self) -> Any:
+        """Height of the surface above the origin [m]; of each point's, see `joined`."""
+        return np.dot(self.point, self.normal)
 
     @property
     def extent(self) -> float:
         """Height above the origin [m]."""
-        return abs(self._height)
+        return abs(float(self._height))
 
     def about(self, origin: FloatArray) -> Plane:
         """The same plane in coordinates relative to a point of space [m], shape (3,)."""
@@ -383,3 +383,25 @@ class Cylinder(_Round):
     def _frame(self) -> tuple[FloatArray, FloatArray]:
         axis = np.asarray(self.axis)
         return np.asarray(self.point), np.eye(3) - np.outer(axis, axis)
+
+
+#: Field that says where an obstacle is, of those that `joined` knows.
+_PLACES = {Plane: "point", Sphere: "centre", Cylinder: "point"}
+
+
+def can_join(obstacle: Any) -> bool:
+    """Whether `joined` knows such obstacles; a class of the user's may be anything."""
+    return type(obstacle) in _PLACES
+
+
+def joined(each: Sequence[Any], counts: Sequence[int]) -> Any:
+    """One obstacle about several origins as one, of points that are relative to any of them.
+
+    Args:
+        each: As of `Obstacle.about`.
+        counts: How many points are relative to each of these origins, one after the other.
+    """
+    name, other = _PLACES[type(each[0])], copy(each[0])
+    places = np.array([getattr(obstacle, name) for obstacle in each])
+    object.__setattr__(other, name, np.repeat(places, counts, axis=0))
+    return other

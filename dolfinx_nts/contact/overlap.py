@@ -84,15 +84,18 @@ class OverlapWatch:
             return whole
 
         between: dict[tuple[tuple[int, ...], bool], list[Any]] = {}
-        obstacles: list[ObstacleContact] = []
+        obstacles, alone = list[ObstacleContact](), list[tuple[int, ...]]()
         self._contacts = list(zip(system.contacts, system.contact_bodies, strict=True))
+        of_body: dict[int, list[Any]] = {}
+        for contact, _ in self._contacts:
+            of_body.setdefault(id(contact.slave.body), []).append(contact)
         for contact, bodies in self._contacts:
             if len(contact.bodies) == 1 and len(contact.slave.facets):
-                alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
+                others = of_body[id(contact.slave.body)]
+                alike = [c.slave for c in others if _same_obstacle(contact, c)]
                 slaves = [s for s in alike if len(s.facets)]
-                obstacles.append(
-                    ObstacleContact(contact, bodies[0], slaves, boundary, start)
-                )
+                obstacles.append(ObstacleContact(contact, bodies[0], slaves, boundary, start))
+                alone.append(bodies)
             elif len(contact.bodies) == 2 and all(b.mesh is not None for b in contact.bodies):
                 itself = contact.slave is contact.master
                 between.setdefault((tuple(sorted(bodies)), itself), []).append(contact)
@@ -104,9 +107,14 @@ class OverlapWatch:
             *([o.contact.slave.body, None] for o in obstacles),
             *([self._bodies[k] for k in bodies] for bodies, _ in between),
         ]
-        # Of pairs of bodies, their numbers and a bound on the way since the last look [m].
-        self._between = np.array([bodies for bodies, _ in between], dtype=int).reshape(-1, 2)
-        self._ways = np.zeros(len(self._between))
+        # Of each its bodies, -1 for an obstacle; which obstacles move; a bound on the way since the
+        # last look [m], and that from which on the next one is due.
+        numbers: list[tuple[int, ...]] = [(bodies[0], -1) for bodies in alone]
+        numbers += [bodies for bodies, _ in between]
+        self._numbers_of = np.array(numbers, dtype=int).reshape(-1, 2)
+        self._driven = np.zeros(len(numbers), dtype=bool)
+        self._driven[: len(obstacles)] = [o.contact.driven for o in obstacles]
+        self._ways, self._dues = np.zeros(len(numbers)), np.full(len(numbers), -np.inf)
         self._last: Sequence[FloatArray] = ()
         self._numbers = {id(c): k for k, c in enumerate(system.contacts)}
         # What the nodes of meshes miss each other by is no overlap.
@@ -146,7 +154,7 @@ class OverlapWatch:
             # Obstacles have no rim and no inner edge.
             if contacts and isinstance(pair, BodyPair):
                 findings += self._of_contacts(pair, u, forces, contacts, edges)
-            self._looked[k] = _Looked(where, pause)
+            self._looked[k], self._dues[k] = _Looked(where, pause), pause.due
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
             key = f.kind, f.about
@@ -224,22 +232,24 @@ class OverlapWatch:
         self, u: Sequence[FloatArray], time: float, last: bool
     ) -> list[tuple[int, list[FloatArray], float]]:
         """Pairs that have moved enough, what is where, and how far they have [m]. Collective."""
-        first, last_ones = len(self._pairs) - len(self._between), self._last
-        if last_ones and len(self._between):
+        last_ones = self._last
+        if last_ones and len(self._ways):
             moved = np.array([
-                body.motion_range(now - before)
-                for body, now, before in zip(self._bodies, u, last_ones, strict=True)
+                *(body.motion_range(now - before)
+                  for body, now, before in zip(self._bodies, u, last_ones, strict=True)),
+                np.zeros((2, 3)),
             ])  # fmt: skip
             self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
-            self._ways += relative_way(moved[self._between])
+            self._ways += relative_way(moved[self._numbers_of])
         self._last = u
         fresh, near = [], []
-        for k, pair in enumerate(self._pairs):
-            looked = self._looked.get(k)
+        dues = np.minimum(self._dues, 0.0) if last else self._dues
+        for k in np.flatnonzero(self._driven | (self._ways > dues)).tolist():
+            looked, where = self._looked.get(k), self._pairs[k].where(u, time)
             if looked is None:
-                fresh.append((k, pair.where(u, time), 0.0))
-            elif k < first or self._ways[k - first] > (0.0 if last else looked.pause.due):
-                near.append((k, looked, pair.where(u, time)))
+                fresh.append((k, where, 0.0))
+            else:
+                near.append((k, looked, where))
         # Largest motion in each direction; the opposite ones are the least.
         moved = np.full((len(near), 2, 2, 3), -np.inf)
         for i, (k, looked, where) in enumerate(near):
@@ -255,12 +265,10 @@ class OverlapWatch:
             looks = way > (0.0 if last else looked.pause.due)
             if looks:
                 due.append((k, where, way))
-            if k >= first:
-                self._ways[k - first] = 0.0 if looks else way
+            self._ways[k] = 0.0 if looks else way
         return fresh + due
 
 
 def _same_obstacle(one: Any, two: Any) -> bool:
-    """Return whether two contacts are of the same body with the same obstacle."""
-    same = one.slave.body is two.slave.body and one.shares_master(two) is not None
-    return same and one.master.motion is two.master.motion
+    """Return whether two contacts of a body are with the same obstacle."""
+    return one.shares_master(two) is not None and one.master.motion is two.master.motion

@@ -314,7 +314,12 @@ class ContactPair:
         Args:
             u: Owned displacements of each of `bodies` [m].
         """
-        return self._moved((self.slave,), u)
+        return self.placed(gather_each(self.surfaces, u))
+
+    def placed(self, moved: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+        """`positions` by displacements of all points of each of `surfaces` [m], (p, 3) each."""
+        both = zip(self.surfaces, moved, strict=True)
+        return tuple(surface.reference - self.origin + way for surface, way in both)
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
@@ -447,12 +452,6 @@ class ContactPair:
         alike = type(self) is type(other) and self.name == other.name
         same_nodes = alike and np.array_equal(self.slave.points, other.slave.points)
         return same_nodes and self.has_master_of(other)
-
-    def _moved(
-        self, surfaces: Sequence[Surface], u: Sequence[FloatArray]
-    ) -> tuple[FloatArray, ...]:
-        both = zip(surfaces, gather_each(surfaces, u), strict=True)
-        return tuple(surface.reference - self.origin + moved for surface, moved in both)
 
 
 def _at_rest(friction: Any) -> float:

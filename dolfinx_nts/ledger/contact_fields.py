@@ -28,34 +28,29 @@ class ContactLoads(NamedTuple):
 
     Attributes:
         contacts: Those of the system.
-        elements: Those of each contact: of nodes, corners and edges that are near.
-        parts: Their solution.
+        elements: Those of each contact that has some, of nodes, corners and edges that are near,
+            with their solution.
         factor: What the step equations multiply forces by [s^2].
     """
 
     contacts: tuple[ContactPair, ...]
-    elements: tuple[tuple[Any, ...], ...]
-    parts: tuple[tuple[Any, ...], ...]
+    elements: dict[int, list[tuple[Any, Any]]]
     factor: float
 
     @classmethod
     def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
         """Of a solved step; its tangents are not kept."""
-        couplings = problem.couplings
-        both: list[list[Any]] = [[] for _ in problem.system.contacts]
-        for k, c, part, _ in couplings.touching(step):
-            both[problem.system.contact_of[k]].append((c, part))
-        for k, c, part in couplings.of_edges(step):
-            both[k].append((c, part))
-        elements = tuple(tuple(c for c, _ in of) for of in both)
-        parts = tuple(tuple(p._replace(tangent=np.empty(0)) for _, p in of) for of in both)
-        return cls(problem.system.contacts, elements, parts, problem.factor)
+        couplings, found = problem.couplings, dict[int, list[tuple[Any, Any]]]()
+        both = [(problem.system.contact_of[k], c, p) for k, c, p, _ in couplings.touching(step)]
+        for k, c, part in [*both, *couplings.of_edges(step)]:
+            found.setdefault(k, []).append((c, part._replace(tangent=np.empty(0))))
+        return cls(problem.system.contacts, found, problem.factor)
 
     def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
         """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""
         pair, found = self.contacts[k], []
         total = [np.zeros((len(surface.points), 3)) for surface in pair.surfaces]
-        for c, part in zip(self.elements[k], self.parts[k], strict=True):
+        for c, part in self.elements.get(k, ()):
             forces = c.nodal_forces(part)
             # Corners are the master's.
             for all_forces, own in zip(
@@ -77,8 +72,7 @@ class ContactLoads(NamedTuple):
             force: Those of its law, shape (share,).
         """
         # Surfaces that are integrated over have neither corners nor others of their kind.
-        both = zip(self.elements[k], self.parts[k], strict=True)
-        found = next((c.pressing(part) for c, part in both), None)
+        found = next((c.pressing(part) for c, part in self.elements.get(k, ())), None)
         if found is None:
             return force
         slave = self.contacts[k].slave

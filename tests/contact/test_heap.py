@@ -170,6 +170,41 @@ def test_what_is_far_apart_is_left_out(monkeypatch):
     assert np.array_equal(places, others)
 
 
+def test_obstacles_of_many_bodies_are_one_and_are_left_out_while_far(monkeypatch):
+    """Bricks that hit a floor, a ball and a post move as where each contact is by itself."""
+    obstacles = [
+        nts.Plane((0, 0, -0.07), (0.1, 0, 1)),
+        nts.Sphere((0.4, 0, -0.155), 0.1),
+        nts.Cylinder((0.8, 0, -0.155), (0, 1, 0), 0.1),
+    ]
+
+    def run():
+        bricks = Bricks(
+            *(((0.4 * k, 0, 0.02 * k), (0.1 * k, 0.2, 0), SIZE, {"velocity": (0, 0, -2.0)})
+              for k in range(3))
+        )  # fmt: skip
+        contacts = [
+            nts.ContactPair(body.surface(everywhere), obstacle, friction=0.4)
+            for body in bricks.bodies for obstacle in obstacles
+        ]  # fmt: skip
+        system = nts.System(bricks.bodies, contacts=contacts)
+        stepper, sought = nts.Stepper(system, nts.EnergyMomentum()), []
+        for _ in range(12):
+            stepper.advance(2e-3)
+            sought.append(len(stepper.problem.couplings.contacts.numbers))
+        return stepper.solution.balance, [b.position for b in bricks.bodies], min(sought)
+
+    table, places, few = run()
+    assert few < len(obstacles) * 3
+    assert table["active"].max() > 1
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+    monkeypatch.setattr(Apart, "look", lambda self, u, motion: None)
+    monkeypatch.setattr("dolfinx_nts.contact.alike._kind", lambda batch: None)
+    other, others, _ = run()
+    assert np.allclose(table["energy"], other["energy"], rtol=1e-11, atol=0.0)
+    assert np.allclose(places, others, rtol=0.0, atol=1e-9 * SIZE)
+
+
 @pytest.mark.slow
 @pytest.mark.fast_on_ranks()
 def test_bricks_dropped_on_each_other_come_to_rest():
