@@ -19,7 +19,8 @@ from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.arguments import check_cells, check_material
 from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
 from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans, NodesOfCells
-from dolfinx_nts.bodies.solid.materials import bulk_over_shear, misfit, with_constants
+from dolfinx_nts.bodies.solid.locking import Locking
+from dolfinx_nts.bodies.solid.materials import misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter
 from dolfinx_nts.bodies.solid.stress_jumps import StressJumps
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
@@ -29,7 +30,7 @@ from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, global_sum, raise_together
+from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
@@ -44,13 +45,6 @@ from dolfinx_nts.validation import (
 _STRESS_FREE = 1e-6
 #: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
 _SMALL_STRAIN = 1e-4
-#: Bulk over shear modulus from which on cells of degree 1 lock in any motion (nu = 0.499).
-_INCOMPRESSIBLE = 500.0
-#: Strain that is rounding.
-_ROUNDED_STRAIN = 1e-12
-#: Largest spread of a body's nodes over the least from which on it may bend: a bar or plate of one
-#: cell over the thickness is some 4 times as long as thick.
-_THIN = 2.3
 
 
 @known_options
@@ -183,8 +177,11 @@ class Continuum(UflBody):
         )
         self._assembled_loads = np.zeros(sum(constant.value.size for constant in self._loads))
         self._seen_at_rest = False
-        self._jumps: tuple[StressJumps, CellMeans | None] | None = None
         self.stressed = None
+        self.locking = Locking(
+            self.space, self.reference, degree, material, volume=volume, bending=bending,
+            jumps=self._stress_jumps,
+        )  # fmt: skip
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:
@@ -299,6 +296,16 @@ class Continuum(UflBody):
         """Virtual work of the viscosity in UFL."""
         return viscous_work(self._eta, u, v, w) * self._dx
 
+    def _stress_jumps(self) -> StressJumps:
+        """Of the stress at the state of `u`."""
+        law, means = self.energy()
+        stress = law.at_point(green_strain(self.gradient))
+        if means is not None:
+            means.compile(self.u)
+        return StressJumps(
+            stress, self.mesh, self._dx, means, lambda: self.potential(self.last_accepted()[0])
+        )
+
     # ---- as of Body
     def lost(self, u1: FloatArray) -> dict[str, float]:
         """As of `Body`."""
@@ -320,64 +327,6 @@ class Continuum(UflBody):
             (load.value, load.follower) if isinstance(load, Pressure) else load.value
             for load in self._traction
         ]
-
-    def stress_jumps(self) -> FloatArray:
-        """As of `Body`."""
-        if self._jumps is None:
-            law, means = self.energy()
-            stress = law.at_point(green_strain(self.gradient))
-            if means is not None:
-                means.compile(self.u)
-            self._jumps = StressJumps(stress, self.mesh, self._dx), means
-        jumps, means = self._jumps
-        if means is not None:
-            means.evaluate()
-        found = jumps.sums()
-        here = self.potential(self.u.x.array[: self.num_owned])
-        stored = abs(float(global_sum(self.comm, np.array([here]))[0]))
-        # Stress times strain is twice the energy. Where nothing is strained all stress is rounding.
-        strained = 2.0 * stored > _ROUNDED_STRAIN * math.sqrt(found[1] * jumps.volume)
-        return found if strained else np.zeros(2)
-
-    @property
-    def remedy_of_locking(self) -> str:
-        """As of `Body`."""
-        if self._linear and compat.cell_name(self.mesh) == "tetrahedron":
-            return "use degree=2, hexahedra, or a finer mesh"
-        if self._modes is not None:
-            return "use degree=2, or a finer mesh"
-        if self._linear and self._volume == "full":
-            thin = "bending=True in thin, stiff parts of regular cells"
-            return f"use volume='projected', {thin}, or a finer mesh"
-        return "use a finer mesh"
-
-    @property
-    def _linear(self) -> bool:
-        return self.degree == 1
-
-    @property
-    def keeps_volume(self) -> bool:
-        """As of `Body`."""
-        full = self._linear and self._volume == "full"
-        return full and bulk_over_shear(self.material) > _INCOMPRESSIBLE
-
-    @cached_property
-    def is_thin(self) -> bool:  # type: ignore[override]
-        """As of `Body`."""
-        if not self._linear or self._modes is not None:
-            return False
-        x = self.reference.reshape(-1, 3)
-        count = global_sum(self.comm, np.array([float(len(x))]))
-        off = x - global_sum(self.comm, x.sum(axis=0)) / count
-        # Spread along the axes of the nodes, which is the same whatever way the body is turned.
-        moments: FloatArray = np.dot(off.T, off)
-        spread = np.linalg.eigvalsh(global_sum(self.comm, moments))
-        if spread[2] < _THIN**2 * spread[0]:
-            return False
-        outside = compat.exterior_facets(self.mesh)
-        on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
-        inside = len(x) - np.count_nonzero(np.unique(on_boundary) < len(x))
-        return not anywhere(self.comm, bool(inside))
 
     def inner(self, u1: FloatArray) -> FloatArray:
         """As of `Body`: the modes of the cells, shape (9 cells,)."""
@@ -417,8 +366,8 @@ class Continuum(UflBody):
     def destroy(self) -> None:
         """As of `Body`."""
         super().destroy()
-        if self._jumps is not None:
-            self._jumps[0].destroy()
+        if self.locking is not None:
+            self.locking.destroy()
 
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
