@@ -4,7 +4,8 @@ from importlib.metadata import version
 
 from dolfinx_nts import mpi_first  # noqa: F401 - before anything of DOLFINx
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure, Traction
+from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.loads import Pressure, Traction
 from dolfinx_nts.bodies.meshes.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.meshes.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of

@@ -13,12 +13,13 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
+from dolfinx_nts.bodies.conditions import VectorInTime
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
 from dolfinx_nts.bodies.nodal_values import motion_on
 from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
-from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads, VectorInTime
+from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads
 from dolfinx_nts.bodies.rigid.rigid_matrix import RigidMatrix
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,13 +10,13 @@ from mpi4py import MPI
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dolfinx_nts.bodies.conditions import VectorInTime
+from dolfinx_nts.bodies.loads import load_at
 from dolfinx_nts.bodies.rigid.inertia import misfit_of_axes
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import FloatArray, OfTime
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import UserFunctionError, agree, call_together, floats, vector_in_time
-
-VectorInTime = Sequence[float] | FloatArray | OfTime
 
 #: Part of a torque along an axis without inertia that counts as none.
 _ALONG = 1e-6
@@ -73,8 +72,7 @@ class RigidLoads:
             UserFunctionError: The torque is about an axis without inertia.
         """
         self.force, self.torque = (
-            (1.0 if callable(value) else ramp)
-            * vector_in_time(self._comm, f"{what} of {self._name!r}", value, time, unit)
+            load_at(self._comm, f"{what} of {self._name!r}", value, unit, time, ramp)
             for what, value, unit in self._given
         )
         self._check_torque(axes)

@@ -14,8 +14,9 @@ from scipy.spatial import cKDTree
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure
+from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
+from dolfinx_nts.bodies.loads import Pressure
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_values import cell_function, motion_on
 from dolfinx_nts.bodies.slender import turns

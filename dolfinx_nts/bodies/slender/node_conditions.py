@@ -10,13 +10,8 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.bodies.conditions import (
-    Dirichlet,
-    Meetings,
-    Pressure,
-    VectorInTime,
-    takes_place,
-)
+from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, VectorInTime, takes_place
+from dolfinx_nts.bodies.loads import Pressure, load_at
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Marker, Settings
 from dolfinx_nts.validation import at_points, is_whole, items, known_options, vector_in_time
@@ -167,9 +162,8 @@ class NodeConditions:
         """
         both = np.zeros((2, self._here.stop - self._here.start, 3))
         for load, weights, what in self._loads:
-            part = 1.0 if callable(load.value) else ramp
-            value = vector_in_time(self._comm, what, load.value, time, load.unit)
-            both[int(load.turns)] += part * weights[:, None] * value
+            value = load_at(self._comm, what, load.value, load.unit, time, ramp)
+            both[int(load.turns)] += weights[:, None] * value
         return both[0], both[1][self.turned]
 
     def _at_dofs(self, time: float) -> list[FloatArray]:

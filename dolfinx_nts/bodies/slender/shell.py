@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from dolfinx.mesh import Mesh
 
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure
+from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.loads import Pressure
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.slender.director_mesh import SIDES, WholeSkin, of_shell
 from dolfinx_nts.bodies.slender.midsurface import check_midsurface, midsurface_of

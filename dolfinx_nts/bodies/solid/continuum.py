@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure, Traction, VectorInTime, facets_of
+from dolfinx_nts.bodies.conditions import Dirichlet, VectorInTime
+from dolfinx_nts.bodies.loads import Pressure, SolidLoads, Traction
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.arguments import check_cells, check_material
 from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
@@ -34,11 +34,8 @@ from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
-    items,
     known_options,
-    number_at,
     require_name,
-    vector_in_time,
 )
 
 #: Stress of an undeformed body, over its stiffness, that counts as none.
@@ -135,32 +132,26 @@ class Continuum(UflBody):
             if value is not None and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
-        traction = items(
-            "traction", traction, lambda t: isinstance(t, Traction | Pressure),
-            "Traction or Pressure",
-        )  # fmt: skip
-        follows = any(isinstance(load, Pressure) and load.follower for load in traction)
         least = check_mesh(mesh, name)
         degree = degree or (2 if compat.cell_name(mesh) == "tetrahedron" else least)
         viscous = is_viscous(viscosity)
         check_cells(mesh, degree, least, name, volume, bending, viscous)
         quadrature_degree = quadrature_degree or 2 * degree
+        space = compat.vector_space(mesh, degree)
+        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
+        self._loads = loads = SolidLoads(space, name, body_force, traction, self._dx)
         super().__init__(
-            compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
-            allow_inversion, self._viscous if viscous else None,
-            self._following if follows else None,
+            space, degree, name, extra_form, quadrature_degree, allow_inversion,
+            self._viscous if viscous else None, loads.following if loads.follows else None,
         )  # fmt: skip
         self.material, self.density, self.viscosity = material, density, viscosity
         self.losses = ("viscous_dissipation",) if viscous else ()
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
         self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
-        self.body_force, self._traction = body_force, traction
+        self.body_force = body_force
+        self.loads_in_time = loads.in_time or extra_form is not None or loads.follows
         # A curved cell's volume is a polynomial, too.
         self._of_mass = max(quadrature_degree, 2 * degree + 3 * (least - 1))
-        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
-        self._ds = self._boundary_measure(quadrature_degree)
-        changing = any(callable(value) for value, _ in self._loads_at(0.0))
-        self.loads_in_time = changing or extra_form is not None or follows
         self._stand(bcs, velocity, displacement)
         self._rho, self._eta = self._density(density), self._on_mesh("viscosity", viscosity)
         self.law = strain_energy(with_constants(material, self.mesh))
@@ -171,11 +162,8 @@ class Continuum(UflBody):
         self._bent = None if self._modes is None else fem.Function(self._modes.space)
         self._check_energy()
         law, means = self.energy()
-        energy, load = law(green_strain(self.gradient)), self._load_in_ufl()
-        (self._load_form,) = self._set_forms(
-            energy * self._dx, load, means=means, others=[self._eta]
-        )
-        self._assembled_loads = np.zeros(sum(constant.value.size for constant in self._loads))
+        energy = law(green_strain(self.gradient)) * self._dx
+        (self._load_form,) = self._set_forms(energy, loads.work, means=means, others=[self._eta])
         self._seen_at_rest = False
         self.stressed = None
         self.locking = Locking(
@@ -184,58 +172,6 @@ class Continuum(UflBody):
         )  # fmt: skip
 
     # ---- set-up
-    def _boundary_measure(self, degree: int) -> Any:
-        indices = []
-        for k, load in enumerate(self._traction):
-            what = f"{type(load).__name__}.where of traction[{k}] of {self.name!r}"
-            everywhere = load.where is None and isinstance(load, Pressure)
-            indices.append(
-                compat.exterior_facets(self.mesh) if everywhere
-                else facets_of(self.mesh, load.where, what)
-            )  # fmt: skip
-        tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
-        empty = np.empty(0, np.int32)
-        index, tag = (
-            np.concatenate([empty, *indices]).astype(np.int32),
-            np.concatenate([empty, *tags]),
-        )
-        shared = len(index) - len(np.unique(index))
-        text = (
-            f"traction of {self.name!r}: {shared} facets carry two loads; add their values up in "
-            "one of them"
-        )
-        raise_together(self.comm, text if shared else None)
-        order = np.argsort(index)
-        data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
-        return ufl.Measure(
-            "ds", self.mesh, subdomain_data=data, metadata={"quadrature_degree": degree}
-        )
-
-    def _load_in_ufl(self) -> Any:
-        """Virtual work of all loads but those that follow; their values are Constants."""
-        w, n = ufl.TestFunction(self.space), ufl.FacetNormal(self.mesh)
-        self._loads = [
-            fem.Constant(self.mesh, np.zeros(() if isinstance(load, Pressure) else 3))
-            for load in (None, *self._traction)
-        ]
-        load = ufl.inner(self._loads[0], w) * self._dx
-        for k, (given, value) in enumerate(zip(self._traction, self._loads[1:], strict=True)):
-            if not isinstance(given, Pressure):
-                load += ufl.inner(value, w) * self._ds(k)
-            elif not given.follower:
-                load -= value * ufl.inner(n, w) * self._ds(k)
-        return load
-
-    def _following(self, u: Any, v: Any, w: Any, t: Any) -> Any:
-        """Virtual work of the pressures that follow, as of `extra_form`."""
-        f = ufl.Identity(3) + ufl.grad(u)
-        area = ufl.dot(ufl.det(f) * ufl.inv(f).T, ufl.FacetNormal(self.mesh))
-        return sum(
-            value * ufl.inner(area, w) * self._ds(k)
-            for k, (load, value) in enumerate(zip(self._traction, self._loads[1:], strict=True))
-            if isinstance(load, Pressure) and load.follower
-        )
-
     def energy(self) -> tuple[Any, CellMeans | None]:
         """W as a function of Green's strain in UFL that forces are made of, and means it makes."""
         if self._volume == "full":
@@ -314,19 +250,11 @@ class Continuum(UflBody):
     @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
-        loads = {"body_force": self.body_force, "traction": self._load_settings}
+        loads = {"body_force": self.body_force, "traction": self._loads.settings}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
         own["viscosity"] = self.viscosity
         own |= {"volume": self._volume, "bending": self._modes is not None}
         return own | loads | super().settings
-
-    @property
-    def _load_settings(self) -> list[Any]:
-        """Of each traction its value, and of a pressure whether it follows."""
-        return [
-            (load.value, load.follower) if isinstance(load, Pressure) else load.value
-            for load in self._traction
-        ]
 
     def inner(self, u1: FloatArray) -> FloatArray:
         """As of `Body`: the modes of the cells, shape (9 cells,)."""
@@ -374,11 +302,8 @@ class Continuum(UflBody):
         if not self._seen_at_rest:
             self._seek_stress_at_rest(rule)
         super().begin_step(rule, moment)
-        for constant, (value, now) in zip(self._loads, self._loads_at(moment.time), strict=True):
-            constant.value[...] = now if callable(value) else moment.ramp * now
-        loads = np.concatenate([constant.value.ravel() for constant in self._loads])
-        if not np.array_equal(loads, self._assembled_loads):
-            self._load, self._assembled_loads = self._forms.assemble(self._load_form), loads
+        if self._loads.begin(moment.time, moment.ramp):
+            self._load = self._forms.assemble(self._load_form)
 
     def _seek_stress_at_rest(self, rule: Integrator) -> None:
         """Note whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
@@ -396,19 +321,3 @@ class Continuum(UflBody):
         stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()
         if not stress <= _STRESS_FREE * stiffness:
             self.stressed = stress / stiffness if stiffness else math.inf
-
-    def _loads_at(self, time: float) -> list[tuple[Any, Any]]:
-        """Body force, tractions and pressures as they were given, and their values at a time."""
-        what = f"body_force of {self.name!r}"
-        now: Any = vector_in_time(self.comm, what, self.body_force, time, "N/m^3")
-        found = [(self.body_force, now)]
-        for k, load in enumerate(self._traction):
-            what = f"{type(load).__name__}.value of traction[{k}] of {self.name!r}"
-            if not isinstance(load, Pressure):
-                now = vector_in_time(self.comm, what, load.value, time, "Pa")
-            elif callable(load.value):
-                now = number_at(self.comm, what, load.value, time, "Pa")
-            else:
-                now = load.value
-            found.append((load.value, now))
-        return found
