@@ -240,8 +240,15 @@ class Rounding:
         out[turns] += np.sqrt(np.abs(each[turns] * place[turns]))
         return out.ravel()
 
-    def measure_springs(self) -> None:
-        """Measure that of forces between bodies in this step. Collective."""
+    def renew(self, bodies: Iterable[int], length: FloatArray) -> None:
+        """Measure it anew at an iterate, and that of forces between bodies. Collective.
+
+        Args:
+            bodies: As of `measure`.
+            length: Displacements there [m], shape (bodies,), if longer than what was predicted.
+        """
+        self.length = np.maximum(self.length, length)
+        self.measure(bodies)
         self._between, self._springs_known = self._springs(), True
 
     @property

@@ -188,6 +188,19 @@ class Unknowns:
                 out[j] = values[place]
         return out
 
+    def moves(
+        self, places: Sequence[FloatArray], known: Mapping[int, FloatArray]
+    ) -> list[float]:
+        """1 for each batch `awake` that is not where it is known to have been here, else 0.
+
+        Args:
+            places: Displacements of each batch [m].
+            known: Those there by the batch's number; one without is elsewhere.
+        """
+        return [
+            float(j not in known or not np.array_equal(places[j], known[j])) for j in self.awake
+        ]
+
     def write(self, values: Sequence[FloatArray | None], out: FloatArray) -> None:
         """Owned coordinates of each batch -> this rank's unknowns; `read` in reverse."""
         for j, place in self._places.items():

@@ -14,6 +14,7 @@ from dolfinx_nts import petsc_compat
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import NO_DIRECTION
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.solve.accuracy import EXACT, Newton
@@ -76,7 +77,8 @@ class StepSolver:
         self.iterates, self._upright = Iterates(problem), InversionGuard(problem)
         self._lent, self._wanders = LentStiffness(problem), False
         self._passed: Evaluation | None = None
-        self._version, self._solved, self._patient = -1, False, True
+        self._laid: Unknowns | None = None
+        self._solved, self._patient = False, True
         self._raised: StepFailedError | None = None
         self._repeats = Redundancy(problem)
         self.snes: PETSc.SNES = None
@@ -227,11 +229,11 @@ class StepSolver:
         self._lent.begin()
         self._wanders = False
         self._tangents.begin()
-        if self._version != self.problem.version:
+        if self._laid is not self.problem.laid:
             self.destroy()
             self.assemble(self.iterates.at(self.problem.x))
             self._configure()
-            self._version = self.problem.version
+            self._laid = self.problem.laid
 
     def assemble(self, e: Evaluation) -> StepMatrix:
         """Jacobian at an iterate, as SNES sees it. Every rank must call it.
@@ -305,7 +307,8 @@ class StepSolver:
         if stalls and not self._measured:
             # An active set that still changes stalls by itself, not by rounding.
             if worst < _NEAR or (unchanged and not self.problem.rounding_is_known):
-                self.problem.measure_rounding(last)
+                longest = self.problem.lengths.displacement_of(last)
+                self.problem.rounding.renew(self.problem.awake, longest)
                 self._measured = True
                 worst = self._worst(last)
         self._solved |= iteration > 0
@@ -401,4 +404,4 @@ class StepSolver:
             self.snes.destroy()
             self._f.destroy()
             self.snes = None
-        self._version = -1
+        self._laid = None
