@@ -11,13 +11,8 @@ from dolfinx_nts.bodies.meshes.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.slender.beam import Beam
-from dolfinx_nts.bodies.slender.node_conditions import (
-    Clamp,
-    LineForce,
-    LineMoment,
-    PointForce,
-    PointMoment,
-)
+from dolfinx_nts.bodies.slender.director_loads import LineForce, LineMoment, PointForce, PointMoment
+from dolfinx_nts.bodies.slender.node_conditions import Clamp
 from dolfinx_nts.bodies.slender.section import Circle, Rectangle, Section
 from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.bodies.solid.continuum import Continuum

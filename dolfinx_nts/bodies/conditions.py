@@ -75,10 +75,7 @@ class Dirichlet:
 
     def __post_init__(self) -> None:
         check_where("Dirichlet", self.where)
-        given = self.components
-        listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
-        if not listed or not given:
-            raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
+        check_components(self.components)
         if isinstance(self.value, fem.Constant | fem.Function):
             if self.value.ufl_shape != (3,):
                 raise ValueError(
@@ -87,6 +84,13 @@ class Dirichlet:
                 )
         else:
             check_value("Dirichlet.value", self.value, "m", _ELSE)
+
+
+def check_components(given: Any) -> None:
+    """Raise a ValueError unless it names some of x, y, z."""
+    listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
+    if not listed or not given:
+        raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
 
 
 def check_where(name: str, where: Marker) -> None:
