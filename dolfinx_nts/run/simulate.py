@@ -15,6 +15,7 @@ from dolfinx_nts.run.paced import paced
 from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Solution
+from dolfinx_nts.run.start import refuse_written
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
@@ -300,7 +301,7 @@ def _run(
                     signal = _march(stepper, steps, output, started, adapt, bar, saver)
                 except Interrupted as within:
                     signal = str(within)
-            stepper.refuse_written()
+            refuse_written(stepper.system, stepper.state.time)
             stepper.look(last=True)
             if signal is None:
                 solution.finish()

@@ -165,7 +165,7 @@ class Restart(Solution):
     """A run up to a checkpoint, from which it goes on; see `restart`.
 
     Attributes:
-        memory: What its stepper remembers beside, see `Stepper.memory`.
+        memory: What its stepper remembers beside, see `RunMemory`.
         nodal_memory: The same of slave nodes.
         pace: What its steps by `Adapt` remember; None: there were none.
     """

@@ -81,10 +81,18 @@ def refuse_overwritten(system: System) -> None:
         )
 
 
-def note_shown(body: Any) -> None:
-    """Keep what a run has just written into a body's u and v, for `refuse_written`."""
-    if body.mesh is not None:
-        body._shown = tuple(f.x.array.copy() for f in (body.u, body.v))
+def accept(system: System, state: State) -> None:
+    """Give bodies a state, and note what their u and v are then, for `refuse_written`."""
+    system.take_inner(state.inner)
+    batches = system.batches
+    ends = (batches.join(values) for values in (state.u, state.v))
+    for body, u, v in zip(batches.bodies, *ends, strict=True):
+        body.accept(u, v)
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        # A body's own `accept` need not call the base's.
+        Body.accept(body, u, v)
+        if body.mesh is not None:
+            body._shown = tuple(f.x.array.copy() for f in (body.u, body.v))
 
 
 def refuse_written(system: System, time: float) -> None:

@@ -193,11 +193,7 @@ class DirectorBody(ElementForces):
         }
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Stress resultants in this rank's cells.
-
-        Args:
-            y: Nodal vectors of the cells [m], shape (n, vectors, 3).
-        """
+        """Stress resultants in this rank's cells, of nodal vectors [m], shape (n, vectors, 3)."""
         raise NotImplementedError
 
     # ---- points
