@@ -34,7 +34,6 @@ from dolfinx_nts.run.start import (
     fitting,
     kind_of,
     of_file,
-    refuse_moved_meshes,
     refuse_overwritten,
 )
 from dolfinx_nts.run.trial import LastSteps, Trial, solved, state_after
@@ -118,11 +117,10 @@ class Stepper:
             start=kind_of(start), start_time=start_time,
         )  # fmt: skip
         begun: Solution | None = of_file(start, system)
-        given = petsc_options or {}
+        self.system, given = system, petsc_options or {}
         self._restitution = float(restitution) if impact == "restored" else None
         self._project_start, self.newton = project_start, newton or Newton()
-        materials = MaterialWatch(system)
-        self.interrupts = Interrupts(system.comm)
+        materials, self.interrupts = MaterialWatch(system), Interrupts(system.comm)
         self._locking = LockingWatch(system, in_time=integrator.inertia)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
@@ -130,7 +128,6 @@ class Stepper:
         )
         self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
         close_at_exit(self)
-        self.system = system
         self.note: Callable[[str], Any] = bool
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._last_steps, self._dampers = LastSteps(), DamperWatch(self.problem)
@@ -152,7 +149,6 @@ class Stepper:
 
     def _set_out(self, start: Solution | None, start_time: float | None) -> None:
         """Accept the state that the run begins with; arguments are those of the class."""
-        refuse_moved_meshes(self.system)
         refuse_overwritten(self.system)
         state = first_state(self.system, start, start_time)
         if self.problem.integrator.inertia and not (start is not None and start.moving):
@@ -160,8 +156,7 @@ class Stepper:
         if not self.problem.integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
-        self._start = start
-        self._started = False
+        self._start, self._started = start, False
         if self.restart is None:
             self._ledger.open(state, start)
             step_warnings.tell_pieces(self.solution, state.time)
