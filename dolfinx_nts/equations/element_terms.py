@@ -48,6 +48,12 @@ class ElementTerms:
         """What they contribute at an iterate, whose part here are the values. Collective."""
         if self._nothing is not None:
             return self._nothing
+        found = self._evaluated(x, values)
+        self._nothing = None if self._laid.blocks or found[1] else found
+        return found
+
+    def _evaluated(self, x: PETSc.Vec, values: FloatArray) -> Parts:
+        """`at` where there may be some."""
         laid, couplings, elements = self._laid, self._couplings, self._couplings.elements
         positions, own = laid.positions(x, elements), laid.own_values(values, elements)
         couplings.tell_loads(own, self._bearing)
@@ -64,9 +70,7 @@ class ElementTerms:
             elements[:touching], couplings.bodies, parts[:touching], positions[:touching],
             self._closed,
         )  # fmt: skip
-        found = parts, None, active
-        self._nothing = None if laid.blocks else found
-        return found
+        return parts, None, active
 
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""

@@ -16,6 +16,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet, VectorInTime
 from dolfinx_nts.bodies.loads import Pressure, SolidLoads, Traction
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
+from dolfinx_nts.bodies.nodal_values import largest_side
 from dolfinx_nts.bodies.solid.arguments import check_cells, check_material
 from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
 from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans, NodesOfCells
@@ -147,7 +148,8 @@ class Continuum(UflBody):
         self.material, self.density, self.viscosity = material, density, viscosity
         self.losses = ("viscous_dissipation",) if viscous else ()
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
-        self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
+        side = largest_side(self.comm, self.reference)
+        self.rounded = 0.0 if isinstance(material, Isotropic) else side
         self.body_force = body_force
         self.loads_in_time = loads.in_time or extra_form is not None or loads.follows
         # A curved cell's volume is a polynomial, too.
