@@ -99,15 +99,9 @@ class StepProblem:
 
     # ---- set-up of a step
     def begin(
-        self,
-        state: State,
-        dt: float,
-        again: Evaluation | None = None,
-        *,
-        search: bool = True,
-        sleep: bool = True,
-        moments: Sequence[EvaluationPoint] | None = None,
-    ) -> None:
+        self, state: State, dt: float, again: Evaluation | None = None, *, search: bool = True,
+        sleep: bool = True, moments: Sequence[EvaluationPoint] | None = None,
+    ) -> None:  # fmt: skip
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 
         Args:
@@ -227,12 +221,7 @@ class StepProblem:
         return self.stabilization.of(body) * du
 
     def guess(
-        self,
-        *,
-        flight: bool,
-        forces: bool,
-        carried: bool = False,
-        again: Evaluation | None = None,
+        self, *, flight: bool, forces: bool, carried: bool = False, again: Evaluation | None = None
     ) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 

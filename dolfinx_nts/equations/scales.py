@@ -49,11 +49,9 @@ class Lengths:
         self._groups, self._group = connected_components(graph, directed=False)
 
     def begin(
-        self,
-        u: Sequence[FloatArray],
-        rates: Sequence[Sequence[FloatArray]],
+        self, u: Sequence[FloatArray], rates: Sequence[Sequence[FloatArray]],
         first: Sequence[FloatArray],
-    ) -> FloatArray:
+    ) -> FloatArray:  # fmt: skip
         """Measure a step. Collective.
 
         Args:
@@ -153,10 +151,7 @@ class Rounding:
     """
 
     def __init__(
-        self,
-        batches: Batches,
-        tangent: Callable[[int], Any],
-        springs: Callable[[], FloatArray],
+        self, batches: Batches, tangent: Callable[[int], Any], springs: Callable[[], FloatArray]
     ) -> None:
         self._batches, self._tangent, self._springs = batches, tangent, springs
         self._diagonal, self._of_factor = np.zeros((2, batches.count))
@@ -280,12 +275,9 @@ class Rounding:
 
 
 def stiffness_between(
-    batches: Batches,
-    laid: Unknowns,
-    elements: Sequence[Any],
-    bodies: Sequence[tuple[int, ...]],
+    batches: Batches, laid: Unknowns, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]],
     u: Sequence[FloatArray],
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Norm of the stiffness of elements without own unknowns, of each body [kg]. Collective.
 
     Args:

@@ -42,13 +42,9 @@ class Unknowns:
     """
 
     def __init__(
-        self,
-        batches: Batches,
-        awake: Sequence[int],
-        elements: Sequence[Any],
-        bodies: Sequence[tuple[int, ...]],
-        loads: Mapping[int, Load] = MappingProxyType({}),
-    ) -> None:
+        self, batches: Batches, awake: Sequence[int], elements: Sequence[Any],
+        bodies: Sequence[tuple[int, ...]], loads: Mapping[int, Load] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         comm = batches.comm
         self._batches = batches
         self.awake = sorted({batches.batch_of(k) for k in awake})
@@ -213,12 +209,9 @@ class Unknowns:
         return self.layout.owned(self.own[name])
 
     def guess(
-        self,
-        places: Sequence[FloatArray],
-        prescribed: Sequence[FloatArray],
-        elements: Sequence[Any],
-        multipliers: Callable[[list[FloatArray]], FloatArray] | None,
-    ) -> None:
+        self, places: Sequence[FloatArray], prescribed: Sequence[FloatArray],
+        elements: Sequence[Any], multipliers: Callable[[list[FloatArray]], FloatArray] | None,
+    ) -> None:  # fmt: skip
         """Write a first guess into `x`, d and f that fit its positions among it. Collective.
 
         Args:

@@ -248,15 +248,10 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
 
 
 def run(
-    stepper: Stepper,
-    steps: Sequence[tuple[float, float]],
-    output: Sequence[Writer],
-    *,
-    progress: bool,
-    remedy: tuple[str, str],
-    adapt: Adapt | None = None,
+    stepper: Stepper, steps: Sequence[tuple[float, float]], output: Sequence[Writer], *,
+    progress: bool, remedy: tuple[str, str], adapt: Adapt | None = None,
     checkpoint: Checkpoint | None = None,
-) -> Solution:
+) -> Solution:  # fmt: skip
     """Advance to each of the times, write, say how it ended, and free the stepper.
 
     Args:

@@ -69,15 +69,9 @@ class Solution(Record):
         return contact_fields.functions(body, nodal)
 
     def warn(
-        self,
-        kind: str,
-        time: float,
-        size: float,
-        text: str,
-        *,
-        grave: bool = False,
+        self, kind: str, time: float, size: float, text: str, *, grave: bool = False,
         about: tuple[str, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Add a warning; every rank must make the same call, see `RunWarnings.add`."""
         root, text = self.system.comm.rank == 0, self.worded(text)
         self.warnings.add(kind, time, size, text, grave=grave, about=about, speak=root)

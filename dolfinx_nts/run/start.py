@@ -336,14 +336,9 @@ def consistent_start(
 
 
 def fitting(
-    problem: StepProblem,
-    state: State,
-    dt: float,
-    *,
-    begun: Solution | None,
-    project: bool,
+    problem: StepProblem, state: State, dt: float, *, begun: Solution | None, project: bool,
     resting: tuple[Newton, Options],
-) -> tuple[State, tuple[float, str] | None]:
+) -> tuple[State, tuple[float, str] | None]:  # fmt: skip
     """The start with rates of prescribed motion and accelerations, which fits the joints.
 
     Collective.
