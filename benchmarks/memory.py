@@ -46,17 +46,17 @@ def main() -> float:
     options = parser.parse_args()
     comm = MPI.COMM_WORLD
     stepper = nts.Stepper(tumbling(comm), nts.EnergyMomentum())
-    start, layouts = 0.0, 0
+    start, new, laid = 0.0, 0, None
     for k in range(1, options.steps + 1):
         stepper.advance(2e-3)
+        new, laid = new + (stepper.problem.laid is not laid), stepper.problem.laid
         if k == options.steps // 10:
-            start, layouts = resident(), stepper.problem.version
+            start, new = resident(), 0
         if comm.rank == 0 and k % (options.steps // 10) == 0:
             active = int(stepper.solution.rows[-1]["active"])
             print(f"step {k:5d}: {resident():8.2f} MB, {active:3d} active", flush=True)
     growth = comm.allreduce(resident() / start - 1, op=MPI.MAX)
     if comm.rank == 0:
-        new = stepper.problem.version - layouts
         print(f"growth {100 * growth:.2f} %, {new} new layouts, {stepper.solution.retries} retries")
     return growth
 

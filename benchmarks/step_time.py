@@ -21,14 +21,14 @@ import dolfinx_nts as nts
 from dolfinx_nts.bodies.solid.continuum import Continuum
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.equations.assembly import StepMatrix
-from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.element_terms import ElementTerms
 from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.solve.newton import StepSolver
 
 #: What a step is made of: label -> class and method that are timed.
 PARTS = {
     "search": (ContactSearch, "_search"),
-    "contact elements": (StepProblem, "_parts_of_elements"),
+    "contact elements": (ElementTerms, "at"),
     "bulk forces": (Continuum, "internal"),
     "bulk matrices": (Continuum, "tangent"),
     "contact into the matrix": (StepMatrix, "assemble"),

@@ -4,19 +4,15 @@ from importlib.metadata import version
 
 from dolfinx_nts import mpi_first  # noqa: F401 - before anything of DOLFINx
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure, Traction
+from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.loads import Pressure, Traction
 from dolfinx_nts.bodies.meshes.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.meshes.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.slender.beam import Beam
-from dolfinx_nts.bodies.slender.node_conditions import (
-    Clamp,
-    LineForce,
-    LineMoment,
-    PointForce,
-    PointMoment,
-)
+from dolfinx_nts.bodies.slender.director_loads import LineForce, LineMoment, PointForce, PointMoment
+from dolfinx_nts.bodies.slender.node_conditions import Clamp
 from dolfinx_nts.bodies.slender.section import Circle, Rectangle, Section
 from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.bodies.solid.continuum import Continuum

@@ -170,11 +170,9 @@ def first_problem(comm: MPI.Comm, problem: str | None) -> str | None:
 
 
 def raise_together(
-    comm: MPI.Comm,
-    problem: str | None,
-    kind: Callable[[str], Exception] = ValueError,
+    comm: MPI.Comm, problem: str | None, kind: Callable[[str], Exception] = ValueError,
     cause: Exception | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Raise with the first rank's problem on every rank, if any rank has one."""
     found = first_problem(comm, problem)
     if found is not None:

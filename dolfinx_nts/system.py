@@ -88,14 +88,17 @@ class System:
             self.comm, **{f"names of {k}": [item.name for item in v] for k, v in given.items()}
         )
         self.check_alive()
-        self._check_bodies()
+        _check_differ("bodies", self.bodies, [body.name for body in self.bodies], "body")
+        _check_communicators(self.bodies)
         self.gravity = vector("gravity", gravity, "m/s^2")
         self.gravity.flags.writeable = False
         self.size = int(self.comm.allreduce(sum(b.num_owned for b in self.bodies)))
         self.declared_joints = self.joints
         own = (joint for body in self.bodies for joint in body.joints)
         self.joints = (*self.declared_joints, *own)
-        self._check_members()
+        _check_contacts(self.contacts, self.bodies)
+        _check_differ("joints", self.declared_joints, [j.name for j in self.joints], "joint")
+        _check_joints(self.joints, self.bodies, self.contacts)
         surfaces = [surface for pair in self.contacts for surface in pair.surfaces]
         # What contacts of other systems use says nothing of this one.
         for surface in surfaces:
@@ -138,54 +141,6 @@ class System:
             names = ", ".join(repr(item.name) for item in those[:_SHOWN])
             named += [f"{kind} {names}{', ...' * (len(those) > _SHOWN)}"] if those else []
         return f"<System of {'; '.join(named)}>"
-
-    def _check_bodies(self) -> None:
-        """Raise a ValueError unless bodies differ, have different names, and one communicator."""
-        for k, b in enumerate(self.bodies):
-            if any(b is other for other in self.bodies[:k]):
-                raise ValueError(f"bodies[{k}]: {b.name!r} is given twice; drop one")
-        names = [b.name for b in self.bodies]
-        if len(set(names)) < len(names):
-            raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
-        for b in self.bodies:
-            if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
-                raise ValueError(
-                    f"bodies: {b.name!r} and {names[0]!r} live on different communicators, of "
-                    f"{b.comm.size} and {self.comm.size} ranks; make all meshes on one, e.g. "
-                    "MPI.COMM_WORLD, each with its cells spread over the ranks"
-                )
-
-    def _check_members(self) -> None:
-        """Raise a ValueError unless contacts and joints are of these bodies, and joints differ."""
-        names = [b.name for b in self.bodies]
-        for pair in self.contacts:
-            for role, body in zip(("slave", "master"), pair.bodies, strict=False):
-                if not any(body is b for b in self.bodies):
-                    raise ValueError(
-                        f"contacts: the {role} body {body.name!r} {_missing(body, names)}"
-                    )
-        for k, joint in enumerate(self.declared_joints):
-            if any(joint is other for other in self.declared_joints[:k]):
-                raise ValueError(f"joints[{k}]: {joint.name!r} is given twice; drop one")
-        labels = [joint.name for joint in self.joints]
-        if len(set(labels)) < len(labels):
-            raise ValueError(f"joints: names {labels} are not unique; pass name= to each joint")
-        both = sorted(set(labels) & set(names))
-        if both:
-            raise ValueError(f"joints, bodies: both have the names {both}; rename the joints")
-        for joint in self.joints:
-            pair = getattr(joint, "pressed_by", None)
-            if pair is not None and not any(pair is other for other in self.contacts):
-                raise ValueError(
-                    f"joints: {joint.name!r} is of contact {pair.name!r}, which is not among "
-                    "contacts; add it"
-                )
-            for body in joint.bodies:
-                if not any(body is b for b in self.bodies):
-                    raise ValueError(
-                        f"joints: {joint.name!r} holds body {body.name!r}, which "
-                        f"{_missing(body, names)}"
-                    )
 
     @cached_property
     def batches(self) -> Batches:
@@ -399,11 +354,60 @@ def cut_off(pair: ContactPair, depth: FloatArray) -> str:
     )
 
 
-def _missing(body: Body, names: Sequence[str]) -> str:
-    """Why a body is none of those of these names, and what to do."""
+def _check_differ(kind: str, given: Sequence[Body | Joint], names: list[str], one: str) -> None:
+    """Raise a ValueError unless what is given, and its names, differ."""
+    for k, item in enumerate(given):
+        if any(item is other for other in given[:k]):
+            raise ValueError(f"{kind}[{k}]: {item.name!r} is given twice; drop one")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{kind}: names {names} are not unique; pass name= to each {one}")
+
+
+def _check_communicators(bodies: Sequence[Body]) -> None:
+    """Raise a ValueError unless bodies live on the same ranks."""
+    first = bodies[0]
+    for b in bodies:
+        if MPI.Comm.Compare(b.comm, first.comm) not in (MPI.IDENT, MPI.CONGRUENT):
+            raise ValueError(
+                f"bodies: {b.name!r} and {first.name!r} live on different communicators, of "
+                f"{b.comm.size} and {first.comm.size} ranks; make all meshes on one, e.g. "
+                "MPI.COMM_WORLD, each with its cells spread over the ranks"
+            )
+
+
+def _check_contacts(contacts: Sequence[ContactPair], bodies: Sequence[Body]) -> None:
+    """Raise a ValueError unless contacts are of these bodies."""
+    for pair in contacts:
+        for role, body in zip(("slave", "master"), pair.bodies, strict=False):
+            _check_among(f"contacts: the {role} body {body.name!r}", body, bodies)
+
+
+def _check_joints(
+    joints: Sequence[Joint], bodies: Sequence[Body], contacts: Sequence[ContactPair]
+) -> None:
+    """Raise a ValueError unless joints are of these bodies and contacts, of other names."""
+    both = sorted({joint.name for joint in joints} & {body.name for body in bodies})
+    if both:
+        raise ValueError(f"joints, bodies: both have the names {both}; rename the joints")
+    for joint in joints:
+        pair = getattr(joint, "pressed_by", None)
+        if pair is not None and not any(pair is other for other in contacts):
+            raise ValueError(
+                f"joints: {joint.name!r} is of contact {pair.name!r}, which is not among "
+                "contacts; add it"
+            )
+        for body in joint.bodies:
+            _check_among(f"joints: {joint.name!r} holds body {body.name!r}, which", body, bodies)
+
+
+def _check_among(what: str, body: Body, bodies: Sequence[Body]) -> None:
+    """Raise a ValueError, with what to do, unless a body is one of these."""
+    if any(body is other for other in bodies):
+        return
+    names = [other.name for other in bodies]
     if body.name in names:
-        return (
-            f"is another object than the one of that name among bodies={names}; make each body "
-            "once, and pass that one to both"
+        raise ValueError(
+            f"{what} is another object than the one of that name among bodies={names}; make each "
+            "body once, and pass that one to both"
         )
-    return f"is not among bodies={names}; add it"
+    raise ValueError(f"{what} is not among bodies={names}; add it")

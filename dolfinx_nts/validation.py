@@ -372,14 +372,9 @@ def number_at(
 
 
 def at_points(
-    comm: MPI.Comm,
-    name: str,
-    function: Callable[[Any], Any],
-    x: FloatArray,
-    rows: tuple[int, ...],
-    kinds: str = "iuf",
-    error: type[Exception] = ValueError,
-) -> Array:
+    comm: MPI.Comm, name: str, function: Callable[[Any], Any], x: FloatArray, rows: tuple[int, ...],
+    kinds: str = "iuf", error: type[Exception] = ValueError,
+) -> Array:  # fmt: skip
     """The user's function at this rank's points; what fails on one rank raises on all.
 
     Args:

@@ -14,6 +14,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.solid.locking import Locking
 from dolfinx_nts.contact.skins import boundary_of_mesh, skin_of_mesh
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
@@ -59,6 +60,7 @@ class Body:
         starts_moved: Whether the user has given it a displacement to start with.
         pieces: Number of parts of its mesh that share no node, of solid bodies. Collective.
         stressed: Stress of the undeformed body over its stiffness, once known and too large.
+        locking: Whether its cells are too stiff; None: it is no solid of cells.
         losses: Columns of the balance table for energy that leaves through it, see `lost`.
         known: Arrays at owned coordinates and what all ranks know of each, shape (nodes, 3).
         destroyed: Whether `destroy` was called.
@@ -91,6 +93,7 @@ class Body:
     starts_moved: bool = False
     pieces: int = 1
     stressed: float | None = None
+    locking: Locking | None = None
     losses: tuple[str, ...] = ()
     known: tuple[tuple[FloatArray, FloatArray], ...] = ()
     destroyed: bool = False
@@ -318,28 +321,6 @@ class Body:
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)
-
-    def stress_jumps(self) -> FloatArray | None:
-        """Squares of what the stress jumps between cells, and of the stress, see `StressJumps`.
-
-        None: it is no solid of cells. Collective.
-        """
-        return None
-
-    @property
-    def remedy_of_locking(self) -> str:
-        """What to do where its cells are too stiff."""
-        return "use a finer mesh"
-
-    @property
-    def keeps_volume(self) -> bool:
-        """Whether its cells are of degree 1 and its material hardly changes its volume."""
-        return False
-
-    @property
-    def is_thin(self) -> bool:
-        """Whether it is long or flat, with one cell of degree 1 over its thickness. Collective."""
-        return False
 
     def take_parameters(self) -> None:
         """Take over changed `parameters` where not all that is made of them is asked for anew.

@@ -1,4 +1,4 @@
-"""What acts on a body's boundary: prescribed displacements and loads."""
+"""Prescribed displacements of a body's boundary."""
 
 from __future__ import annotations
 
@@ -23,11 +23,9 @@ from dolfinx_nts.types import FloatArray, IntArray, Marker
 from dolfinx_nts.validation import (
     UserFunctionError,
     at_points,
-    is_finite,
     is_whole,
     items,
     known_options,
-    require_bool,
     vector,
     vector_in_time,
 )
@@ -76,11 +74,8 @@ class Dirichlet:
     components: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
-        _check_where("Dirichlet", self.where)
-        given = self.components
-        listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
-        if not listed or not given:
-            raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
+        check_where("Dirichlet", self.where)
+        check_components(self.components)
         if isinstance(self.value, fem.Constant | fem.Function):
             if self.value.ufl_shape != (3,):
                 raise ValueError(
@@ -88,75 +83,17 @@ class Dirichlet:
                     f"{_ELSE}"
                 )
         else:
-            _check_value("Dirichlet.value", self.value, "m", _ELSE)
+            check_value("Dirichlet.value", self.value, "m", _ELSE)
 
 
-@known_options
-@dataclass(frozen=True)
-class Traction:
-    """Dead traction on a part of the boundary.
-
-    Attributes:
-        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
-        value: Force per reference area [Pa]: a vector, or a function of time.
-
-    Raises:
-        TypeError: `where` is meshtags alone.
-        ValueError: `value` is neither three finite numbers nor a function.
-    """
-
-    where: Marker
-    value: VectorInTime
-
-    def __post_init__(self) -> None:
-        _check_where("Traction", self.where)
-        _check_value("Traction.value", self.value, "Pa", "a function of time that returns them")
+def check_components(given: Any) -> None:
+    """Raise a ValueError unless it names some of x, y, z."""
+    listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
+    if not listed or not given:
+        raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
 
 
-@known_options
-@dataclass(frozen=True)
-class Pressure:
-    """Pressure on the boundary of a continuum, or on cells of a shell.
-
-    It pushes a continuum inwards, and a shell's middle surface from the bottom to the top. One that
-    follows acts along the normal and on the area that the surface has then.
-
-    On a continuum it is taken at the place where the integrator takes its forces: in the middle of
-    the step, in equilibrium at its end. A uniform one all around has neither resultant nor moment,
-    and its work is p times the change of the volume but for a third-order term.
-
-    On a shell its force in a step of `EnergyMomentum` is the mean on the way of the step. So the
-    work of a constant one on a closed shell is p times the change of the volume exactly. Its moment
-    on a closed shell, none, is then off by a third-order term; with `Midpoint` it is exact.
-
-    Attributes:
-        value: [Pa]: a number, or a function of time.
-        where: None: everywhere. Of a continuum facets as of `Traction`; of a shell a function
-            x (3, n) -> bool (n,), and it acts on cells at all whose corners it is true.
-        follower: Whether it follows the body; False: it acts along the normal and on the area of
-            the reference, a dead load.
-
-    Raises:
-        TypeError: follower is no bool, or `where` is meshtags alone.
-        ValueError: value is neither a finite number nor a function.
-    """
-
-    value: float | Callable[[float], float]
-    where: Marker = None
-    follower: bool = True
-
-    def __post_init__(self) -> None:
-        require_bool("follower", self.follower)
-        _check_where("Pressure", self.where)
-        _refuse_ufl("Pressure.value", self.value, "a finite number [Pa], or a function of time")
-        if not callable(self.value) and not is_finite(self.value):
-            raise ValueError(
-                f"Pressure.value={self.value!r}: must be a finite number [Pa], or a function of "
-                "time that returns one"
-            )
-
-
-def _check_where(name: str, where: Marker) -> None:
+def check_where(name: str, where: Marker) -> None:
     """Raise if it is meshtags without a tag, as a pair with a star leaves them."""
     if hasattr(where, "find") and not isinstance(where, str):
         raise TypeError(
@@ -165,14 +102,14 @@ def _check_where(name: str, where: Marker) -> None:
         )
 
 
-def _check_value(name: str, value: Any, unit: str, or_else: str) -> None:
+def check_value(name: str, value: Any, unit: str, or_else: str) -> None:
     """Raise unless it is a vector or may be a function."""
-    _refuse_ufl(name, value, f"three finite components [{unit}], or {or_else}")
+    refuse_ufl(name, value, f"three finite components [{unit}], or {or_else}")
     if not callable(value):
         vector(name, value, unit, or_else=or_else)
 
 
-def _refuse_ufl(name: str, value: Any, wanted: str) -> None:
+def refuse_ufl(name: str, value: Any, wanted: str) -> None:
     """Raise TypeError where it is of UFL, which can be called, but is no function."""
     if hasattr(value, "ufl_shape"):
         raise TypeError(f"{name}={value!s}: is of UFL ({type(value).__name__}); pass {wanted}")

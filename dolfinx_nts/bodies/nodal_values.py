@@ -1,17 +1,19 @@
-"""Values at the nodes of a body that users give, and in its cells that they ask for."""
+"""Nodes of a body: their values that users give, and their order; values in its cells."""
 
 from __future__ import annotations
 
 import re
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.parallel import gather_on_root, global_max, raise_together
+from dolfinx_nts.types import FloatArray, IntArray
 from dolfinx_nts.validation import UserFunctionError, at_points, vector
 
 
@@ -78,3 +80,22 @@ def cell_function(mesh: Mesh, name: str, values: FloatArray) -> fem.Function:
     function.x.array.reshape(-1, rows.shape[1])[of_cells] = rows
     function.x.scatter_forward()
     return function
+
+
+def order_of_input(space: fem.FunctionSpace) -> IntArray:
+    """Nodes in the order in which the cells of the input name them, on rank 0. Collective."""
+    mesh, index_map = space.mesh, space.dofmap.index_map
+    owned = mesh.topology.index_map(mesh.topology.dim).size_local
+    cells = compat.cell_dofs(space)[:owned]
+    nodes = index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(cells.shape)
+    original = np.asarray(mesh.topology.original_cell_index[:owned], dtype=np.int64)
+    order = np.argsort(gather_on_root(mesh.comm, original))
+    _, first = np.unique(gather_on_root(mesh.comm, nodes)[order], return_index=True)
+    return np.argsort(first)
+
+
+def largest_side(comm: MPI.Comm, reference: FloatArray) -> float:
+    """Of the box around nodes of all ranks [m], from their coordinates. Collective."""
+    x = reference.reshape(-1, 3)
+    ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+    return float(global_max(comm, ends).sum(axis=0).max())

@@ -53,13 +53,9 @@ class Triplets:
     """
 
     def __init__(
-        self,
-        comm: MPI.Comm,
-        size: tuple[int, int],
-        parts: Sequence[Entries],
-        bodies: Sequence[Body] = (),
-        to_whole: Callable[[int, IntArray], IntArray] | None = None,
-    ) -> None:
+        self, comm: MPI.Comm, size: tuple[int, int], parts: Sequence[Entries],
+        bodies: Sequence[Body] = (), to_whole: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> None:  # fmt: skip
         none = np.empty(0, np.int64)
         rows, cols = [none, *(p.rows for p in parts)], [none, *(p.cols for p in parts)]
         self._elements = [(part.where, part.weights) for part in parts]
@@ -146,15 +142,9 @@ class StepMatrix:
     """
 
     def __init__(
-        self,
-        layout: Layout,
-        bodies: Sequence[Body],
-        elements: Sequence[ElementBlocks],
-        *,
-        split: bool = False,
-        blocked: bool = False,
-        kind: str = "baij",
-    ) -> None:
+        self, layout: Layout, bodies: Sequence[Body], elements: Sequence[ElementBlocks], *,
+        split: bool = False, blocked: bool = False, kind: str = "baij",
+    ) -> None:  # fmt: skip
         self._layout, self._elements = layout, list(elements)
         self._in_operator: list[FloatArray] = []
         self._num_bodies, fields = len(bodies), range(layout.counts.shape[1])

@@ -322,11 +322,9 @@ class Couplings:
 
 
 def _together(
-    each: Sequence[JointCoupling],
-    bodies: Sequence[tuple[int, ...]],
-    declared: int,
+    each: Sequence[JointCoupling], bodies: Sequence[tuple[int, ...]], declared: int,
     batches: Batches,
-) -> list[OfJoints]:
+) -> list[OfJoints]:  # fmt: skip
     """Joints between bodies of one batch that are alike as one, all others one by one.
 
     Args:

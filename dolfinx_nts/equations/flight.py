@@ -9,10 +9,20 @@ import numpy as np
 
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.equations.body_tangents import BodyTangents
+from dolfinx_nts.equations.mass_solves import Saddle
 from dolfinx_nts.equations.scales import Lengths
 from dolfinx_nts.equations.supports import StepSupports
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.types import BoolArray, FloatArray
+
+#: A motion of supports goes on as before if it differs by less than this part.
+_STEADY = 1e-6
+#: Motion of supports, over the scene, that tells which forces they make.
+_TRIED = 1e-7
+#: How much farther than its supports a body may come, as the end of a beam whose other end turns.
+_FARTHEST = 1e3
 
 
 class Flight:
@@ -72,3 +82,38 @@ class Flight:
             flown = du if len(of) > 1 else self._supports.ahead(of[0], du, u1)
             self.momentum.append(self._inertial(body, flown))
         return speed == 0.0
+
+    def follow_supports(
+        self, u0: Sequence[FloatArray], touching: set[int], tangents: BodyTangents
+    ) -> None:
+        """Let bodies follow what supports do beside their motion, in `ends`. Collective.
+
+        Else the cells at the supports would take all of it: those of a material that hardly changes
+        its volume have no way back from there.
+
+        Args:
+            u0: As of `begin`.
+            touching: Bodies that may touch, which stay where they are: what stands in their way is
+                not known yet.
+            tangents: Matrices of the batches.
+        """
+        comm, batches = self._batches.comm, self._batches
+        for j, body in enumerate(batches.bodies):
+            if body.rigid or not body.driven or touching.intersection(batches.numbers[j]):
+                continue
+            start, end, jump = u0[j], self.ends[j], np.zeros(body.num_owned)
+            jump[body.fixed] = self.jumps[j]
+            sizes = np.array([np.abs(a).max(initial=0.0) for a in (jump, end - start)])
+            largest, moved = global_max(comm, sizes)
+            if not largest > _STEADY * moved:
+                continue
+            part = _TRIED * self._lengths.radius / largest
+            pull = (body.internal(start + part * jump) - body.internal(start)) / part
+            pull[body.fixed] = 0.0
+            saddle = Saddle(tangents.of_all(j, start))
+            way = saddle.solve(-pull)
+            saddle.destroy()
+            way[body.fixed] = 0.0
+            far = global_max(comm, np.abs(way).max(initial=0.0, keepdims=True))[0]
+            if far <= _FARTHEST * largest:
+                end += way

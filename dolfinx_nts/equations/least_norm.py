@@ -90,13 +90,9 @@ class NullSpace:
     """
 
     def __init__(
-        self,
-        laid: Unknowns,
-        comm: MPI.Comm,
-        elements: Sequence[Any],
-        bodies: Sequence[tuple[int, ...]],
-        parts: Sequence[Any],
-    ) -> None:
+        self, laid: Unknowns, comm: MPI.Comm, elements: Sequence[Any],
+        bodies: Sequence[tuple[int, ...]], parts: Sequence[Any],
+    ) -> None:  # fmt: skip
         places, entries, scales, start, count = [], [], [np.empty(0)], 0, 0
         for batch, numbers, part in zip(elements, bodies, parts, strict=True):
             n, m, size = batch.num_elements, batch.widths["constraints"], num_multipliers(batch)

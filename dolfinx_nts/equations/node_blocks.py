@@ -104,12 +104,9 @@ class NodeBlocks:
     """
 
     def __init__(
-        self,
-        bodies: Sequence[PETSc.Mat],
-        found: Sequence[Pattern],
-        to_whole: Callable[[int, IntArray], IntArray],
-        elements: Sequence[IntArray],
-    ) -> None:
+        self, bodies: Sequence[PETSc.Mat], found: Sequence[Pattern],
+        to_whole: Callable[[int, IntArray], IntArray], elements: Sequence[IntArray],
+    ) -> None:  # fmt: skip
         comm, index = bodies[0].comm.tompi4py(), PETSc.IntType
         self._bodies, self._rows, self._patterns = list(bodies), [], []
         local = sum(a.getLocalSize()[0] for a in bodies) // 3

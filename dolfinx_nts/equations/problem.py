@@ -10,44 +10,33 @@ pure: nothing here changes a State, and history changes only when a step is acce
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import compress
-from operator import is_not
 from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.contact.alike import Alike
-from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.body_tangents import BodyTangents
 from dolfinx_nts.equations.couplings import Couplings
+from dolfinx_nts.equations.element_terms import ElementTerms
 from dolfinx_nts.equations.flight import Flight
+from dolfinx_nts.equations.kept_unknowns import KeptUnknowns
 from dolfinx_nts.equations.loads import Loads
-from dolfinx_nts.equations.mass_solves import Saddle
 from dolfinx_nts.equations.scales import Lengths, Rounding, stiffness_between
-from dolfinx_nts.equations.shared_weight import ActiveRows, SharedWeight
+from dolfinx_nts.equations.shared_weight import SharedWeight
 from dolfinx_nts.equations.sleep import Sleepers
 from dolfinx_nts.equations.stabilization import Stabilization
 from dolfinx_nts.equations.supports import StepSupports
 from dolfinx_nts.equations.unknowns import Unknowns
-from dolfinx_nts.interaction.elements import Raised, Step, evaluate_here, raise_of_all
+from dolfinx_nts.interaction.elements import Step, raise_of_all
 from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, EvaluationPoint
-from dolfinx_nts.parallel import Asking, global_max, sums_and_largest, together
+from dolfinx_nts.parallel import sums_and_largest
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
-
-#: A motion of supports goes on as before if it differs by less than this part.
-_STEADY = 1e-6
-#: Motion of supports, over the scene, that tells which forces they make.
-_TRIED = 1e-7
-#: How much farther than its supports a body may come, as the end of a beam whose other end turns.
-_FARTHEST = 1e3
-#: What elements contribute on this rank, or raise there, and rows of weight that is shared.
-_Parts = tuple[tuple[Any, ...], Raised | None, ActiveRows]
 
 
 class StepProblem:
@@ -64,15 +53,12 @@ class StepProblem:
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
         couplings: All that makes elements.
-        unknowns: Their layout; made anew whenever the elements' coordinates change.
-        version: Changes whenever `unknowns` does.
         dives: Whether free flight presses bodies deep into each other, after `begin`.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
         rounding: What part of the forces on bodies is rounding.
         stabilization: In statics, what holds each node at t_n.
         lengths: Lengths of the scene, and of the step after `begin`.
-        extents: Largest `Elements.extent` of each of `Couplings.mechanisms`, on all ranks [m].
         loads: When the step takes which loads.
         is_awake: Whether each body is in the step, shape (bodies,).
         sleepers: Bodies that the step leaves out.
@@ -83,30 +69,23 @@ class StepProblem:
     """
 
     def __init__(
-        self, system: System, integrator: Any, *, rtol: float, condense: bool, sleep: bool = False
-    ) -> None:
+        self, system: System, integrator: Any, *, rtol: float, condense: bool,
+        sleep: bool = False,
+    ) -> None:  # fmt: skip
         self.system, self.integrator = system, integrator
         self.rtol, self.condense = rtol, condense
         self.batches = system.batches
-        self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
-        # What batches contribute that have no element on any rank: nothing, at every iterate.
-        self._of_none: _Parts | None = None
-        self._alike = Alike(())
         self.awake: tuple[int, ...] = ()
         self.is_awake = np.zeros(self.batches.count, dtype=bool)
-        self._numbers: tuple[Any, ...] | None = None
         self.couplings = Couplings(system)
         self.shared_weight = SharedWeight(system.comm, system.contacts)
-        self.unknowns: Unknowns | None = None
-        self.version, self.dives = 0, False
+        self._kept, self.dives = KeptUnknowns(self.batches, self.couplings), False
         self._again: Evaluation | None = None
-        self.lengths, self.loads = Lengths(system), Loads(system, integrator)
+        self.lengths, self.loads = (lengths := Lengths(system)), Loads(system, integrator)
         self.sleepers, self._sleep = Sleepers(system, self.couplings, self.loads), sleep
         self.supports = StepSupports(system, integrator)
-        self.flight = Flight(
-            self.batches, integrator, self.supports, self.lengths, self._inertial
-        )
-        lengths = self.lengths
+        self.flight = Flight(self.batches, integrator, self.supports, lengths, self._inertial)
+        self._terms = ElementTerms(self.couplings, self.shared_weight, lengths, rtol)
         self.stabilization = Stabilization(
             system, lengths.radius or lengths.director, lengths.director or lengths.radius,
             self.loads.largest,
@@ -120,15 +99,9 @@ class StepProblem:
 
     # ---- set-up of a step
     def begin(
-        self,
-        state: State,
-        dt: float,
-        again: Evaluation | None = None,
-        *,
-        search: bool = True,
-        sleep: bool = True,
-        moments: Sequence[EvaluationPoint] | None = None,
-    ) -> None:
+        self, state: State, dt: float, again: Evaluation | None = None, *, search: bool = True,
+        sleep: bool = True, moments: Sequence[EvaluationPoint] | None = None,
+    ) -> None:  # fmt: skip
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 
         Args:
@@ -142,11 +115,13 @@ class StepProblem:
         """
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
         self.tangents.factor = self.factor
-        self._evaluated, self._u0 = {}, self.batches.join(state.u)
+        self._evaluated = dict[int, tuple[FloatArray, ...]]()
+        self._u0 = self.batches.join(state.u)
         self.loads.begin(state, dt, moments)
         at_rest = self.flight.begin(state, self._u0, dt)
         if not self.integrator.inertia and again is None:
-            self._follow_supports()
+            touching = set().union(*self.system.pair_bodies)
+            self.flight.follow_supports(self._u0, touching, self.tangents)
         lengths, first = self.lengths, self.flight.ends
         way = [a - b for a, b in zip(first, self._u0, strict=True)]
         if again is not None:
@@ -166,34 +141,6 @@ class StepProblem:
         if self._sleep and sleep:
             self.sleepers.find(at_rest & (lengths.motion == 0.0), state.u, self.rounding)
         self._lay_out(again)
-
-    def _follow_supports(self) -> None:
-        """Let bodies follow what supports do beside their motion, in the first guess. Collective.
-
-        Else the cells at the supports would take all of it: those of a material that hardly changes
-        its volume have no way back from there. Bodies that may touch stay where they are: what
-        stands in their way is not known yet.
-        """
-        touching = set().union(*self.system.pair_bodies)
-        for j, body in enumerate(self.batches.bodies):
-            if body.rigid or not body.driven or touching.intersection(self.batches.numbers[j]):
-                continue
-            u0, end, jump = self._u0[j], self.flight.ends[j], np.zeros(body.num_owned)
-            jump[body.fixed] = self.flight.jumps[j]
-            sizes = np.array([np.abs(a).max(initial=0.0) for a in (jump, end - u0)])
-            largest, moved = global_max(self.system.comm, sizes)
-            if not largest > _STEADY * moved:
-                continue
-            part = _TRIED * self.lengths.radius / largest
-            pull = (body.internal(u0 + part * jump) - body.internal(u0)) / part
-            pull[body.fixed] = 0.0
-            saddle = Saddle(self.tangents.of_all(j, u0))
-            way = saddle.solve(-pull)
-            saddle.destroy()
-            way[body.fixed] = 0.0
-            far = global_max(self.system.comm, np.abs(way).max(initial=0.0, keepdims=True))[0]
-            if far <= _FARTHEST * largest:
-                end += way
 
     @property
     def elements(self) -> list[Any]:
@@ -235,42 +182,17 @@ class StepProblem:
         Args:
             again: Solution of this step with fewer elements, which the next one goes on from.
         """
-        system = self.system
         self.awake = self.sleepers.awake()
         self.is_awake[:] = False
         self.is_awake[list(self.awake)] = True
-        elements = self.elements
-        widths = np.array([list(c.widths.values()) for c in elements])
-        combined = [a for c in elements if c.combination is not None for a in c.combination]
-        places = [a for c in elements for a in c.points()]
-        numbers = (np.array(self.awake), widths, *places, *combined)
-        self._bearing = self.couplings.loads()
-        contacts = self.couplings.contacts
+        contacts, bearing = self.couplings.contacts, self.couplings.loads()
         # From bodies that free flight has pressed deep into each other iterates may not find back.
         dives = [contacts.dives()] if self.integrator.inertia else []
-        changed, _, *deep = together(
-            system.comm, [self._changes(numbers), contacts.watch(), *dives]
-        )
+        _, *deep = self._kept.lay_out(self.awake, bearing, [contacts.watch(), *dives])
         self.dives = any(deep)
-        if changed:
-            self.destroy()
-            of = self.couplings.bodies
-            self.unknowns = Unknowns(self.batches, self.awake, elements, of, self._bearing)
-            self.version += 1
-            self._numbers = numbers
-        self._of_none = None
+        self._terms.begin(self.laid, bearing)
         self._again = again
         self.first_guess()
-
-    def _changes(self, numbers: tuple[Any, ...]) -> Asking[bool]:
-        """Whether any rank's elements have other numbers than before, as of `together`.
-
-        Notes the extents of all elements.
-        """
-        own = [float(not _equal(numbers, self._numbers)), *self.couplings.extents()]
-        _, (changed, self._extent, *linked) = yield np.empty(0), np.array(own)
-        self.extents = np.array(linked)
-        return bool(changed)
 
     def first_guess(self) -> None:
         """Write into `x` what the iterations of the step begin with."""
@@ -281,15 +203,16 @@ class StepProblem:
         """PETSc vector of the unknowns, holding the first guess after `begin`."""
         return self.laid.x
 
-    def of_body(self, k: int) -> slice:
-        """Where a body that is awake stands among this rank's unknowns."""
-        return self.laid.of_body(k)
-
     @property
     def laid(self) -> Unknowns:
-        """The layout, after `begin`."""
-        assert self.unknowns is not None, "begin comes first"
-        return self.unknowns
+        """The layout, after `begin`; another one whenever the elements' coordinates change."""
+        assert self._kept.now is not None, "begin comes first"
+        return self._kept.now
+
+    @property
+    def extents(self) -> FloatArray:
+        """Largest `Elements.extent` of each of `Couplings.mechanisms`, on all ranks [m]."""
+        return self._kept.extents
 
     def _inertial(self, body: Body, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
@@ -298,12 +221,7 @@ class StepProblem:
         return self.stabilization.of(body) * du
 
     def guess(
-        self,
-        *,
-        flight: bool,
-        forces: bool,
-        carried: bool = False,
-        again: Evaluation | None = None,
+        self, *, flight: bool, forces: bool, carried: bool = False, again: Evaluation | None = None
     ) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
@@ -338,13 +256,12 @@ class StepProblem:
             return last
         # Most often bodies at rest before something hits them stay where the last iterate had them.
         places = laid.read(values, self._u0)
-        moves = self._moves(places, {j: terms[0] for j, terms in self._evaluated.items()})
+        moves = laid.moves(places, {j: terms[0] for j, terms in self._evaluated.items()})
         ways = [np.abs(places[j] - self._u0[j]).max(initial=0.0) for j in laid.awake]
         moved = float(max(ways, default=0.0))
-        parts, raised, active = self._of_none or self._parts_of_elements(x, values)
-        turned = last is not None and self._turned(last, parts)
+        parts, raised, active = self._terms.at(x, values)
+        turned, measures = self._terms.turned(last, parts), self._terms.measures(parts)
         own = [float(raised is not None), float(new), float(turned), moved, *moves]
-        measures = self._measures(parts)
         counts, found = sums_and_largest(comm, active.counts, np.append(own, measures))
         if found[0]:
             raise_of_all(comm, raised)
@@ -369,47 +286,6 @@ class StepProblem:
             measures=found[4 + len(moves) :].reshape(measures.shape), turned=bool(found[2]),
         )  # fmt: skip
 
-    def _parts_of_elements(self, x: PETSc.Vec, values: FloatArray) -> _Parts:
-        """What elements contribute at an iterate, or raise here; rows of weight that is shared.
-
-        Collective.
-
-        Args:
-            x: The iterate.
-            values: Its part here.
-        """
-        laid, elements = self.laid, self.elements
-        positions = laid.positions(x, elements)
-        own = laid.own_values(values, elements)
-        self.couplings.tell_loads(own, self._bearing)
-        alike = self._alike
-        if len(elements) != len(alike.of) or any(map(is_not, elements, alike.of)):
-            self._alike = alike = Alike(elements, alike)
-        parts, raised = evaluate_here(
-            self.system.comm, alike.elements, alike.places(positions), alike.own(own)
-        )
-        if raised is not None:
-            return (), raised, self.shared_weight.none
-        parts, touching = alike.apart(parts), self.couplings.num_touching
-        found = parts, None, self.shared_weight.active(
-            elements[:touching], self.couplings.bodies, parts[:touching], positions[:touching],
-            self._closed,
-        )  # fmt: skip
-        self._of_none = None if laid.blocks else found
-        return found
-
-    def _turned(self, last: Evaluation, parts: tuple[Any, ...]) -> bool:
-        """Whether contacts have another status on this rank than in the last iterate."""
-        both = zip(last.parts, parts[: self.couplings.num_touching], strict=False)
-        return any(bool((a.status != b.status).any()) for a, b in both)
-
-    def _measures(self, parts: tuple[Any, ...]) -> FloatArray:
-        """`Evaluation.measures` on this rank; zeros where elements raised."""
-        found = np.zeros((len(self.elements) if "augmented" in self.laid.own else 0, 2))
-        for row, batch, part in zip(found, self.elements, parts, strict=False):
-            row[:] = batch.largest(part)[2:]
-        return found
-
     def _without_elements(self, j: int, u1: FloatArray) -> tuple[FloatArray, ...]:
         """A batch's u1, du, internal and external force and equation, no elements. Collective."""
         body, du = self.batches.bodies[j], u1 - self._u0[j]
@@ -418,36 +294,9 @@ class StepProblem:
         total = self._inertial(body, du) - self.flight.momentum[j] + internal - external
         return u1, du, internal, external, total
 
-    def elsewhere(
-        self, places: Sequence[FloatArray], known: Mapping[int, FloatArray]
-    ) -> list[int]:
-        """Batches with bodies awake that are not where they are known to have been. Collective.
-
-        Args:
-            places: Displacements of each batch [m].
-            known: Those there by the batch's number; one without is elsewhere.
-        """
-        moves = global_max(self.system.comm, np.array(self._moves(places, known)))
-        return list(compress(self.laid.awake, moves))
-
-    def _moves(
-        self, places: Sequence[FloatArray], known: Mapping[int, FloatArray]
-    ) -> list[float]:
-        """1 for each batch awake that is `elsewhere` on this rank, else 0."""
-        awake = self.laid.awake
-        return [float(j not in known or not np.array_equal(places[j], known[j])) for j in awake]
-
     def displacements(self, x: FloatArray) -> list[FloatArray]:
         """Those of each batch at an iterate [m]: this rank's part of both."""
         return self.laid.read(x, self._u0)
-
-    def _closed(self, batch: ContactElements) -> float:
-        """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
-        motion = float(self.lengths.motion.max())
-        gap = [0.0, 1.0, 0.0, 0.0]
-        rounded = motion + self.lengths.rounded
-        limits = batch.ratios(None, gap, motion, rounded, self.rtol)
-        return 1.0 / limits[f"{batch.name} constraints"]
 
     def residual(self, e: Evaluation) -> FloatArray:
         """This rank's part of the residual, zero at prescribed coordinates."""
@@ -466,40 +315,16 @@ class StepProblem:
         springs = any(not any(batch.widths.values()) for batch in self.elements)
         return self.rounding.is_known(self.awake, springs=springs)
 
-    def measure_rounding(self, e: Evaluation) -> None:
-        """Measure the rounding of the forces anew, at an iterate's motion. Collective.
-
-        Args:
-            e: Iterate whose motion is longer than the one that was predicted, at most the extent.
-        """
-        self.rounding.length = np.maximum(self.rounding.length, self.lengths.displacement_of(e))
-        self.rounding.measure(self.awake)
-        self.rounding.measure_springs()
-
     def stiffness_between(self) -> FloatArray:
         """Norm of the stiffness at t_n of elements without unknowns, of each body. Collective."""
         of = self.couplings.bodies
         return stiffness_between(self.batches, self.laid, self.elements, of, self._u0)
 
     @property
-    def momentum_rounding(self) -> float:
-        """Change of momentum in the step that is rounding [kg m/s]."""
-        rate = self.integrator.rate(self.dt)
-        return float(self.rounding.forces.sum() * np.sqrt(self.system.size) * rate)
-
-    @property
     def rounded_length(self) -> float:
         """Largest length whose rounding enters forces and gaps [m]."""
-        return max(self.lengths.span, self._extent)
+        return max(self.lengths.span, self._kept.extent)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
-        if self.unknowns is not None:
-            self.unknowns.destroy()
-        self.unknowns, self._numbers = None, None
-
-
-def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
-    if b is None or len(a) != len(b):
-        return False
-    return all(x is y or np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+        self._kept.destroy()

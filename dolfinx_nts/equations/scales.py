@@ -49,11 +49,9 @@ class Lengths:
         self._groups, self._group = connected_components(graph, directed=False)
 
     def begin(
-        self,
-        u: Sequence[FloatArray],
-        rates: Sequence[Sequence[FloatArray]],
+        self, u: Sequence[FloatArray], rates: Sequence[Sequence[FloatArray]],
         first: Sequence[FloatArray],
-    ) -> FloatArray:
+    ) -> FloatArray:  # fmt: skip
         """Measure a step. Collective.
 
         Args:
@@ -153,10 +151,7 @@ class Rounding:
     """
 
     def __init__(
-        self,
-        batches: Batches,
-        tangent: Callable[[int], Any],
-        springs: Callable[[], FloatArray],
+        self, batches: Batches, tangent: Callable[[int], Any], springs: Callable[[], FloatArray]
     ) -> None:
         self._batches, self._tangent, self._springs = batches, tangent, springs
         self._diagonal, self._of_factor = np.zeros((2, batches.count))
@@ -240,8 +235,15 @@ class Rounding:
         out[turns] += np.sqrt(np.abs(each[turns] * place[turns]))
         return out.ravel()
 
-    def measure_springs(self) -> None:
-        """Measure that of forces between bodies in this step. Collective."""
+    def renew(self, bodies: Iterable[int], length: FloatArray) -> None:
+        """Measure it anew at an iterate, and that of forces between bodies. Collective.
+
+        Args:
+            bodies: As of `measure`.
+            length: Displacements there [m], shape (bodies,), if longer than what was predicted.
+        """
+        self.length = np.maximum(self.length, length)
+        self.measure(bodies)
         self._between, self._springs_known = self._springs(), True
 
     @property
@@ -273,12 +275,9 @@ class Rounding:
 
 
 def stiffness_between(
-    batches: Batches,
-    laid: Unknowns,
-    elements: Sequence[Any],
-    bodies: Sequence[tuple[int, ...]],
+    batches: Batches, laid: Unknowns, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]],
     u: Sequence[FloatArray],
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Norm of the stiffness of elements without own unknowns, of each body [kg]. Collective.
 
     Args:

@@ -92,13 +92,10 @@ class SharedWeight:
         self.none = ActiveRows(_joined([]), [], np.zeros(comm.size if self.any_rigid else 0))
 
     def active(
-        self,
-        elements: Sequence[ContactElements],
-        bodies: Sequence[tuple[int, ...]],
-        parts: Sequence[Contribution],
-        places: Sequence[FloatArray],
+        self, elements: Sequence[ContactElements], bodies: Sequence[tuple[int, ...]],
+        parts: Sequence[Contribution], places: Sequence[FloatArray],
         closed: Callable[[ContactElements], float],
-    ) -> ActiveRows:
+    ) -> ActiveRows:  # fmt: skip
         """Return the rows of rigid contacts that may share a weight, for `divide`.
 
         Args:
@@ -192,14 +189,9 @@ def _joined(rows: Sequence[Rows]) -> Rows:
 
 
 def _rows(
-    batch: ContactElements,
-    numbers: tuple[int, ...],
-    part: Contribution,
-    x: FloatArray,
-    on: IntArray,
-    row: int,
-    limit: Any,
-) -> Rows:
+    batch: ContactElements, numbers: tuple[int, ...], part: Contribution, x: FloatArray,
+    on: IntArray, row: int, limit: Any,
+) -> Rows:  # fmt: skip
     push, start, scale = np.zeros((len(on), 2, 6)), 0, batch.law.scale[on]
     rows = part.tangent[on, row, : batch.num_coordinates] / scale[:, None]
     y = x[on]

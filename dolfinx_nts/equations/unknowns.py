@@ -42,13 +42,9 @@ class Unknowns:
     """
 
     def __init__(
-        self,
-        batches: Batches,
-        awake: Sequence[int],
-        elements: Sequence[Any],
-        bodies: Sequence[tuple[int, ...]],
-        loads: Mapping[int, Load] = MappingProxyType({}),
-    ) -> None:
+        self, batches: Batches, awake: Sequence[int], elements: Sequence[Any],
+        bodies: Sequence[tuple[int, ...]], loads: Mapping[int, Load] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         comm = batches.comm
         self._batches = batches
         self.awake = sorted({batches.batch_of(k) for k in awake})
@@ -188,6 +184,19 @@ class Unknowns:
                 out[j] = values[place]
         return out
 
+    def moves(
+        self, places: Sequence[FloatArray], known: Mapping[int, FloatArray]
+    ) -> list[float]:
+        """1 for each batch `awake` that is not where it is known to have been here, else 0.
+
+        Args:
+            places: Displacements of each batch [m].
+            known: Those there by the batch's number; one without is elsewhere.
+        """
+        return [
+            float(j not in known or not np.array_equal(places[j], known[j])) for j in self.awake
+        ]
+
     def write(self, values: Sequence[FloatArray | None], out: FloatArray) -> None:
         """Owned coordinates of each batch -> this rank's unknowns; `read` in reverse."""
         for j, place in self._places.items():
@@ -200,12 +209,9 @@ class Unknowns:
         return self.layout.owned(self.own[name])
 
     def guess(
-        self,
-        places: Sequence[FloatArray],
-        prescribed: Sequence[FloatArray],
-        elements: Sequence[Any],
-        multipliers: Callable[[list[FloatArray]], FloatArray] | None,
-    ) -> None:
+        self, places: Sequence[FloatArray], prescribed: Sequence[FloatArray],
+        elements: Sequence[Any], multipliers: Callable[[list[FloatArray]], FloatArray] | None,
+    ) -> None:  # fmt: skip
         """Write a first guess into `x`, d and f that fit its positions among it. Collective.
 
         Args:

@@ -51,17 +51,10 @@ class Constraints(EveryStep):
     """
 
     def __init__(
-        self,
-        name: str,
-        bodies: tuple[int, ...],
-        sides: Sequence[Points],
-        equations: Equations,
-        driven: Callable[[tuple[float, ...]], tuple[Equations, FloatArray]] | None = None,
-        *,
-        redundant: bool = True,
-        upright: Upright | Equations | None = None,
-        arm: Arm | None = None,
-    ) -> None:
+        self, name: str, bodies: tuple[int, ...], sides: Sequence[Points], equations: Equations,
+        driven: Callable[[tuple[float, ...]], tuple[Equations, FloatArray]] | None = None, *,
+        redundant: bool = True, upright: Upright | Equations | None = None, arm: Arm | None = None,
+    ) -> None:  # fmt: skip
         n = len(equations.value)
         rows = ConstraintRows(
             tuple(sides), equations, upright, arm, np.full(n, SHIFT if redundant else 0.0),

@@ -273,11 +273,9 @@ def entries_of(num_coordinates: int, pattern: BoolArray) -> BoolArray:
 
 
 def evaluate_together(
-    comm: MPI.Comm,
-    elements: Sequence[Any],
-    places: Sequence[FloatArray],
+    comm: MPI.Comm, elements: Sequence[Any], places: Sequence[FloatArray],
     own: Sequence[Mapping[str, FloatArray]],
-) -> tuple[Any, ...]:
+) -> tuple[Any, ...]:  # fmt: skip
     """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
 
     Args:
@@ -297,11 +295,9 @@ def evaluate_together(
 
 
 def evaluate_here(
-    comm: MPI.Comm,
-    elements: Sequence[Any],
-    places: Sequence[FloatArray],
+    comm: MPI.Comm, elements: Sequence[Any], places: Sequence[FloatArray],
     own: Sequence[Mapping[str, FloatArray]],
-) -> tuple[tuple[Any, ...], Raised | None]:
+) -> tuple[tuple[Any, ...], Raised | None]:  # fmt: skip
     """As `evaluate_together`, and what elements raised on this rank, of which others do not know.
 
     Collective. If any rank has raised, all are to call `raise_of_all`.

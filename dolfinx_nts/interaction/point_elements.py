@@ -179,11 +179,9 @@ class EveryStep:
     rests = False
 
     def __init__(
-        self,
-        bodies: tuple[int, ...],
-        make: Callable[[Step, Any], Any],
+        self, bodies: tuple[int, ...], make: Callable[[Step, Any], Any],
         remember: Callable[[Any], Any] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.bodies, self.make, self._remember = [bodies], make, remember
         self.elements: list[Any] = []
         self.step: Step | None = None

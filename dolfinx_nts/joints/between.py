@@ -124,11 +124,7 @@ class Between(OfTwo, ABC):
     axes: Sequence[Vector] = ()
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        points: tuple[str, Any, Any],
-        name: str | None,
+        self, a: Body | None, b: Body | None, points: tuple[str, Any, Any], name: str | None
     ) -> None:
         super().__init__((a, b), name)
         if a is not None and a is b:

@@ -55,16 +55,10 @@ class Spherical(Between):
     """
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        *,
-        point: Places,
-        displacement: Callable[[float], Any] | None = None,
-        cone: Any = None,
-        friction: JointFriction | None = None,
-        name: str | None = None,
-    ) -> None:
+        self, a: Body | None, b: Body | None, *, point: Places,
+        displacement: Callable[[float], Any] | None = None, cone: Any = None,
+        friction: JointFriction | None = None, name: str | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(a, b, ("point", point, point), name)
         self.bearing = 3
         if displacement is not None:
@@ -87,17 +81,6 @@ class _WithAxis(Between):
     """A joint with an axis n, and directions m1 and m2 at right angles, at both ends.
 
     Its first `bearing` multipliers are the forces by which its friction may be given.
-
-    Args:
-        a: A body, or None.
-        b: A body, or None.
-        point: Of both at the start [m].
-        axis: n at the start, of any length.
-        name: In messages and files; default: kind and bodies.
-
-    Raises:
-        TypeError: An argument is of another kind.
-        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
     def __init__(
@@ -155,18 +138,10 @@ class Revolute(_WithAxis):
     """
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        *,
-        point: Places,
-        axis: Places,
-        angle: Number | None = None,
-        friction: JointFriction | None = None,
-        limits: Any = None,
-        motor: Motor | None = None,
-        name: str | None = None,
-    ) -> None:
+        self, a: Body | None, b: Body | None, *, point: Places, axis: Places,
+        angle: Number | None = None, friction: JointFriction | None = None, limits: Any = None,
+        motor: Motor | None = None, name: str | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(a, b, point=point, axis=axis, name=name)
         self.bearing = 3
         if angle is not None:
@@ -226,20 +201,11 @@ class Cylindrical(_WithAxis):
     """
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        *,
-        point: Places,
-        axis: Places,
-        sliding_friction: JointFriction | None = None,
-        sliding_limits: Any = None,
-        sliding_motor: Motor | None = None,
-        turning_friction: JointFriction | None = None,
-        turning_limits: Any = None,
-        turning_motor: Motor | None = None,
-        name: str | None = None,
-    ) -> None:
+        self, a: Body | None, b: Body | None, *, point: Places, axis: Places,
+        sliding_friction: JointFriction | None = None, sliding_limits: Any = None,
+        sliding_motor: Motor | None = None, turning_friction: JointFriction | None = None,
+        turning_limits: Any = None, turning_motor: Motor | None = None, name: str | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(a, b, point=point, axis=axis, name=name)
         sliding = sliding_friction, sliding_limits, sliding_motor
         turning = turning_friction, turning_limits, turning_motor
@@ -277,18 +243,10 @@ class Prismatic(_WithAxis):
     """
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        *,
-        point: Places,
-        axis: Places,
-        displacement: Number | None = None,
-        friction: JointFriction | None = None,
-        limits: Any = None,
-        motor: Motor | None = None,
-        name: str | None = None,
-    ) -> None:
+        self, a: Body | None, b: Body | None, *, point: Places, axis: Places,
+        displacement: Number | None = None, friction: JointFriction | None = None,
+        limits: Any = None, motor: Motor | None = None, name: str | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(a, b, point=point, axis=axis, name=name)
         if displacement is not None:
             self.drive("displacement", displacement, "m", number_at)
@@ -330,18 +288,11 @@ class Planar(_WithAxis):
     """
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        *,
-        point: Places,
-        axis: Places,
+        self, a: Body | None, b: Body | None, *, point: Places, axis: Places,
         sliding_friction: JointFriction | None = None,
-        turning_friction: JointFriction | None = None,
-        turning_limits: Any = None,
-        turning_motor: Motor | None = None,
-        name: str | None = None,
-    ) -> None:
+        turning_friction: JointFriction | None = None, turning_limits: Any = None,
+        turning_motor: Motor | None = None, name: str | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(a, b, point=point, axis=axis, name=name)
         self.bearing = 1
         turning = turning_friction, turning_limits, turning_motor
@@ -452,14 +403,9 @@ class Distance(Between):
     """
 
     def __init__(
-        self,
-        a: Body | None,
-        b: Body | None,
-        *,
-        points: Places,
-        length: float | Number | None = None,
-        name: str | None = None,
-    ) -> None:
+        self, a: Body | None, b: Body | None, *, points: Places,
+        length: float | Number | None = None, name: str | None = None,
+    ) -> None:  # fmt: skip
         if floats(points).shape != (2, 3):
             raise ValueError(f"points={points!r}: pass two points [m], that of a and that of b")
         super().__init__(a, b, ("points", *points), name)

@@ -51,7 +51,8 @@ def check_momentum(
     arm = problem.lengths.span + math.sqrt(total[8])
     total[:7] *= rule.rate(dt)
     activity = total[6] + total[7]
-    allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * activity + problem.momentum_rounding
+    allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * activity
+    allowed += problem.rounding.forces.sum() * math.sqrt(problem.system.size) * rule.rate(dt)
     allowed += (_FAR * total[12] + problem.system.size * _SQUARED_AWAY) * rule.rate(dt)
     off = after["linear_momentum"] - before["linear_momentum"] - total[:3] - total[9:12]
     # About the middle of the bodies: about a far origin every error of P would look like one of J.

@@ -65,13 +65,9 @@ class _Series:
     """Files of one body: NAME.h5 holds the numbers, NAME.xdmf tells ParaView what they are."""
 
     def __init__(
-        self,
-        body: Body,
-        index: int,
-        contacts: Mapping[str, int],
-        folder: Path,
+        self, body: Body, index: int, contacts: Mapping[str, int], folder: Path,
         functions: Sequence[Own] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.body, self.index, self.contacts, self._functions = body, index, contacts, functions
         self.path = folder / _file_name(body.name)
         self._times = 0
@@ -187,11 +183,9 @@ class _Series:
         return found
 
     def append(
-        self,
-        time: float,
-        fields: Mapping[str, FloatArray],
+        self, time: float, fields: Mapping[str, FloatArray],
         own: Mapping[str, tuple[bool, FloatArray]],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Add one time; rank 0 only. Both files are complete and closed afterwards.
 
         Args:
@@ -277,13 +271,9 @@ class Fields:
     """
 
     def __init__(
-        self,
-        folder: StrPath,
-        *,
-        every: int = 1,
-        interval: float | None = None,
+        self, folder: StrPath, *, every: int = 1, interval: float | None = None,
         functions: Iterable[Own] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.folder, self._cadence = as_path("folder", folder), Cadence(every, interval)
         self.functions = checked(functions)
         self._series: list[_Series] = []

@@ -79,19 +79,11 @@ class Film:
     """
 
     def __init__(
-        self,
-        path: StrPath,
-        *,
-        every: int = 1,
-        interval: float | None = None,
-        forces: bool = True,
-        colour: Colour = "speed",
-        view: tuple[float, float] = (22.0, -60.0),
-        limits: tuple[float, float] | None = None,
-        width: float = 5.0,
-        units: str = "m",
+        self, path: StrPath, *, every: int = 1, interval: float | None = None, forces: bool = True,
+        colour: Colour = "speed", view: tuple[float, float] = (22.0, -60.0),
+        limits: tuple[float, float] | None = None, width: float = 5.0, units: str = "m",
         hide: Sequence[Any] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.path = as_path("path", path)
         if self.path.suffix.lower() != ".gif":
             raise ValueError(f"path={str(path)!r}: pass a file that ends with .gif")

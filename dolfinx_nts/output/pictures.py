@@ -26,18 +26,10 @@ _DOTS = 200
 
 
 def picture(
-    scene: Any,
-    path: StrPath,
-    *,
-    colour: Colour = "speed",
-    title: str = "",
-    labels: bool = False,
-    view: tuple[float, float] = (22.0, -60.0),
-    limits: tuple[float, float] | None = None,
-    width: float = 7.0,
-    units: str = "m",
-    hide: Sequence[Any] = (),
-) -> None:
+    scene: Any, path: StrPath, *, colour: Colour = "speed", title: str = "", labels: bool = False,
+    view: tuple[float, float] = (22.0, -60.0), limits: tuple[float, float] | None = None,
+    width: float = 7.0, units: str = "m", hide: Sequence[Any] = (),
+) -> None:  # fmt: skip
     """Draw a scene as it stands; every rank calls it, rank 0 writes.
 
     Obstacles are drawn as far as the bodies reach. Points and axes of joints are drawn over the

@@ -94,11 +94,9 @@ class Numbering:
         return tuple(found)
 
     def pack(
-        self,
-        state: State,
-        fields: Mapping[str, Sequence[FloatArray]],
+        self, state: State, fields: Mapping[str, Sequence[FloatArray]],
         nodal: Mapping[str, Sequence[Array]],
-    ) -> Tables:
+    ) -> Tables:  # fmt: skip
         """Arrays of a state. Collective.
 
         Args:

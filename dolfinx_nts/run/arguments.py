@@ -17,15 +17,32 @@ from dolfinx_nts.validation import is_finite, require_bool, require_one_of, requ
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
 
-def check_scheme(system: System, integrator: Any, newton: Any, petsc_options: Any) -> None:
-    """Raise where the equations of steps, or their solver, are not asked for as they should be.
-
-    Arguments are those of `Stepper`.
+def check_arguments(
+    system: System, integrator: Any, newton: Any, petsc_options: Any, before_step: Any,
+    impact: Any, restitution: Any, *, start: Any, start_time: Any, **flags: Any,
+) -> None:  # fmt: skip
+    """Raise where a `Stepper` is not asked for as it should be; arguments are its. Collective.
 
     Raises:
         TypeError: One is of another kind.
-        ValueError: An option of PETSc has no effect, or a body was destroyed.
+        ValueError: One is out of range or another one on other ranks, an option of PETSc has no
+            effect, or a body was destroyed.
     """
+    same_run(
+        system, integrator=integrator, newton=newton, petsc_options=petsc_options, start=start,
+        start_time=start_time, before_step=before_step, impact=impact, restitution=restitution,
+        **flags,
+    )  # fmt: skip
+    _check_scheme(system, integrator, newton, petsc_options)
+    for name, flag in flags.items():
+        require_bool(name, flag)
+    if not callable(before_step) and before_step is not None:
+        raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
+    _check_impact(system, integrator, impact, restitution)
+
+
+def _check_scheme(system: System, integrator: Any, newton: Any, petsc_options: Any) -> None:
+    """Raise where the equations of steps, or their solver, are not asked for as they should be."""
     if not isinstance(system, System):
         raise TypeError(f"system={system!r}: pass a System([body, ...])")
     system.check_alive()
@@ -56,19 +73,8 @@ def check_scheme(system: System, integrator: Any, newton: Any, petsc_options: An
         )
 
 
-def check_run(before_step: Any, **flags: Any) -> None:
-    """Raise a TypeError where a hook is no function, or a flag no truth value."""
-    for name, flag in flags.items():
-        require_bool(name, flag)
-    if not callable(before_step) and before_step is not None:
-        raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
-
-
-def check_impact(system: System, integrator: Integrator, impact: Any, restitution: Any) -> None:
-    """Raise a ValueError where impacts cannot be treated as asked for. Collective.
-
-    Arguments are those of `Stepper`.
-    """
+def _check_impact(system: System, integrator: Integrator, impact: Any, restitution: Any) -> None:
+    """Raise a ValueError where impacts cannot be treated as asked for. Collective."""
     require_one_of("impact", impact, IMPACTS)
     if not (is_finite(restitution) and 0.0 <= restitution <= 1.0):
         raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")

@@ -134,7 +134,7 @@ class Saver:
             return
         memory = None if self.pace is None else self.pace.memory
         more = {"acceleration": memory.accelerations} if memory else {}
-        tables = self._numbering.pack(state, more, stepper.nodal_memory)
+        tables = self._numbering.pack(state, more, stepper.memory.nodal)
         of_record, notes = stepper.solution.packed()
         tables |= of_record
         notes |= {
@@ -142,7 +142,7 @@ class Saver:
             "loads": self._loads,
             "time": state.time,
             "pace": memory and memory._replace(accelerations=())._asdict(),
-            **stepper.memory,
+            **stepper.memory.numbers,
         }
         try:
             comm = stepper.system.comm

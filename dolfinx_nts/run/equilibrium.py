@@ -12,10 +12,10 @@ from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.load_steps import LoadStepper
 from dolfinx_nts.run.run_file import Saved
-from dolfinx_nts.run.simulate import run, writers
+from dolfinx_nts.run.simulate import run
 from dolfinx_nts.run.solution import Equilibrium
 from dolfinx_nts.run.start import kind_of, of_file
-from dolfinx_nts.run.writer import Writer
+from dolfinx_nts.run.writer import Writer, writers
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.system import System
 from dolfinx_nts.types import BeforeStep, FloatArray, Options

@@ -119,8 +119,7 @@ class LoadStepper(Stepper):
         """
         if self._started:
             return
-        self._call_before(dt)
-        self._materials.changed()
+        self._between.begin(self.state.time, dt)
         self._ledger.open(self.state, self._start)
         step_warnings.tell_cut_off(self.solution, self.state)
         step_warnings.tell_units(self.solution, self.state.time, in_time=False)
@@ -129,7 +128,7 @@ class LoadStepper(Stepper):
     def _step(self, dt: float, time: float) -> None:
         # The problem is about to begin another step, which may fail.
         self._solved = None
-        self._prepare(dt)
+        self._between.prepare(self.state, dt)
         old = self.state
         step, state, iterations, relaxed = self._relax(dt, time)
         self._relaxations = _RELAXATIONS

@@ -57,9 +57,9 @@ class LockingWatch:
     def _now(self) -> FloatArray:
         found = np.zeros_like(self._sums)
         for of_body, body in zip(found, self._bodies, strict=True):
-            jumps = body.stress_jumps()
-            if jumps is not None and np.isfinite(jumps).all():
-                of_body[:] = jumps
+            if body.locking is not None:
+                of_body[:] = body.locking.stress_jumps()
+        found[~np.isfinite(found).all(axis=1)] = 0.0
         return found
 
     def tell(self, solution: Solution, time: float) -> None:
@@ -71,15 +71,16 @@ class LockingWatch:
         seen = self._is_due and self._in_time
         sums = (self._sums if seen else self._sums + self._now()).tolist()
         for body, (jumps, whole) in zip(self._bodies, sums, strict=True):
-            if not whole > 0.0:
+            locking = body.locking
+            if locking is None or not whole > 0.0:
                 continue
             share = jumps / whole
-            if body.keeps_volume:
+            if locking.keeps_volume:
                 solution.warn(
                     "locking", time, max(share, 1.0),
                     f"cells of body {body.name!r} are of degree 1 and can hardly move, as its "
                     "material hardly changes its volume: it may be many times too stiff; "
-                    f"{body.remedy_of_locking}",
+                    f"{locking.remedy}",
                     about=(body.name,),
                 )  # fmt: skip
             elif share > _LOCKED:
@@ -88,10 +89,10 @@ class LockingWatch:
                     f"cells of body {body.name!r} may be too stiff for its motion: the squares "
                     f"of its stress's jumps from cell to cell are {share:.2g} of those of the "
                     f"stress; more than {_LOCKED} means errors of several per cent, in stress "
-                    f"and pressure above all; {body.remedy_of_locking}",
+                    f"and pressure above all; {locking.remedy}",
                     about=(body.name,),
                 )  # fmt: skip
-            elif body.is_thin:
+            elif locking.is_thin:
                 solution.warn(
                     "one cell thick", time, 1.0,
                     f"body {body.name!r} has no node inside: where it bends, one cell of degree 1 "

@@ -77,12 +77,9 @@ class Saved(Record):
 
 
 def save(
-    record: Record,
-    system: System,
-    state: State,
-    fields: Mapping[str, Sequence[npt.NDArray[np.float64]]],
-    path: Path,
-) -> None:
+    record: Record, system: System, state: State,
+    fields: Mapping[str, Sequence[npt.NDArray[np.float64]]], path: Path,
+) -> None:  # fmt: skip
     """Write a run, and further fields of its bodies; see `Solution.save`. Collective."""
     from dolfinx_nts.output import scene_record as scenes
     from dolfinx_nts.output import state_file as files

@@ -67,16 +67,9 @@ class RunWarnings(Mapping[str, RunWarning]):
         return list(self._found.values())
 
     def add(
-        self,
-        kind: str,
-        time: float,
-        size: float,
-        text: str,
-        *,
-        grave: bool,
-        about: tuple[str, ...] = (),
-        speak: bool = True,
-    ) -> None:
+        self, kind: str, time: float, size: float, text: str, *, grave: bool,
+        about: tuple[str, ...] = (), speak: bool = True,
+    ) -> None:  # fmt: skip
         """Note a warning; every rank must make the same call.
 
         Args:

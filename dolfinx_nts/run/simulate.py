@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.interrupts import Interrupted
@@ -15,9 +14,10 @@ from dolfinx_nts.run.paced import paced
 from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Solution
+from dolfinx_nts.run.start import refuse_written
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
-from dolfinx_nts.run.writer import Writer
+from dolfinx_nts.run.writer import Writer, call_here, call_writers, writers
 from dolfinx_nts.solve.accuracy import ACCURACY, Newton
 from dolfinx_nts.system import System
 from dolfinx_nts.types import BeforeStep, Options
@@ -25,7 +25,6 @@ from dolfinx_nts.validation import (
     OutputError,
     StepFailedError,
     UserFunctionError,
-    items,
     known_options,
     require_bool,
     require_one_of,
@@ -38,10 +37,6 @@ logger = logging.getLogger(__name__)
 _CUT_FAR = 0.01
 #: Order of the integrators whose error `Adapt` knows.
 _ADAPTED = 2
-
-
-def _is_writer(item: Any) -> bool:
-    return all(callable(getattr(item, name, None)) for name in ("start", "write", "close"))
 
 
 @known_options
@@ -253,15 +248,10 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
 
 
 def run(
-    stepper: Stepper,
-    steps: Sequence[tuple[float, float]],
-    output: Sequence[Writer],
-    *,
-    progress: bool,
-    remedy: tuple[str, str],
-    adapt: Adapt | None = None,
+    stepper: Stepper, steps: Sequence[tuple[float, float]], output: Sequence[Writer], *,
+    progress: bool, remedy: tuple[str, str], adapt: Adapt | None = None,
     checkpoint: Checkpoint | None = None,
-) -> Solution:
+) -> Solution:  # fmt: skip
     """Advance to each of the times, write, say how it ended, and free the stepper.
 
     Args:
@@ -279,14 +269,9 @@ def run(
 
 
 def _run(
-    stepper: Stepper,
-    steps: Sequence[tuple[float, float]],
-    output: Sequence[Writer],
-    progress: bool,
-    remedy: tuple[str, str],
-    adapt: Adapt | None,
-    checkpoint: Checkpoint | None,
-) -> Solution:
+    stepper: Stepper, steps: Sequence[tuple[float, float]], output: Sequence[Writer],
+    progress: bool, remedy: tuple[str, str], adapt: Adapt | None, checkpoint: Checkpoint | None,
+) -> Solution:  # fmt: skip
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
     started: list[Writer] = []
@@ -300,7 +285,7 @@ def _run(
                     signal = _march(stepper, steps, output, started, adapt, bar, saver)
                 except Interrupted as within:
                     signal = str(within)
-            stepper.refuse_written()
+            refuse_written(stepper.system, stepper.state.time)
             stepper.look(last=True)
             if signal is None:
                 solution.finish()
@@ -328,11 +313,11 @@ def _run(
             _stop(stepper, text, told=f"{headline}: the run's status says where and what to do")
         except BaseException:
             # Where one rank alone comes here, no other answers.
-            _call(stepper, started, "close")
+            call_here(stepper, started, "close")
             raise
         if saver is not None:
             saver.save()
-        unclosed = _call_together(stepper, started, "close")
+        unclosed = call_writers(stepper, started, "close")
     finally:
         stepper.close()
     problem, cause = lost if lost[0] is not None else unclosed
@@ -352,14 +337,9 @@ def _last_look(stepper: Stepper) -> None:
 
 
 def _march(
-    stepper: Stepper,
-    steps: Sequence[tuple[float, float]],
-    output: Sequence[Writer],
-    started: list[Writer],
-    adapt: Adapt | None,
-    bar: Any,
-    saver: Saver | None,
-) -> str | None:
+    stepper: Stepper, steps: Sequence[tuple[float, float]], output: Sequence[Writer],
+    started: list[Writer], adapt: Adapt | None, bar: Any, saver: Saver | None,
+) -> str | None:  # fmt: skip
     """Make the steps and write them; tells the signal that ended them before.
 
     Arguments as of `run`, and the writers it has started.
@@ -378,11 +358,11 @@ def _march(
     if saver is not None:
         saver.pace = pace
     started.extend(output)
-    problem, cause = _call_together(stepper, output, "start")
+    problem, cause = call_writers(stepper, output, "start")
     if problem is not None:
         raise cause or RuntimeError(problem)
     for whole, last in _moves(stepper, steps, pace):
-        problem, cause = _call_together(stepper, output, "write", last=last)
+        problem, cause = call_writers(stepper, output, "write", last=last)
         if problem is not None:
             raise OutputError(problem, stepper.solution) from cause
         # A run that went on from a part of a step would not have the steps of the whole run.
@@ -426,30 +406,6 @@ def _end(solution: Solution, reason: str) -> None:
     solution.status = f"{solution.status}; {reason}" if ended else reason
 
 
-def _call(
-    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
-) -> tuple[str | None, Exception | None]:
-    """Call a method of all writers, also when one raises: what the first raised here, and it."""
-    problem, cause = None, None
-    for k, writer in enumerate(output):
-        try:
-            getattr(writer, name)(stepper, **options)
-        except Exception as error:  # any: a rank that raises alone would leave the others waiting
-            if cause is None:
-                what = f"output[{k}] ({type(writer).__name__}): {name}"
-                what += f" at t={stepper.state.time!r} raised {error!r}"
-                problem, cause = f"{what}; correct it, or leave this writer out", error
-    return problem, cause
-
-
-def _call_together(
-    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
-) -> tuple[str | None, Exception | None]:
-    """`_call` with the first problem of any rank, on all ranks alike. Every rank must call it."""
-    problem, cause = _call(stepper, output, name, **options)
-    return first_problem(stepper.system.comm, problem), cause
-
-
 def _moves(
     stepper: Stepper, steps: Sequence[tuple[float, float]], pace: Pace | None
 ) -> Iterator[tuple[bool, bool]]:
@@ -462,9 +418,3 @@ def _moves(
         else:
             for _ in paced(stepper, pace, time):
                 yield True, final and stepper.state.time == time
-
-
-def writers(output: Any) -> tuple[Writer, ...]:
-    """The argument `output`, checked."""
-    wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
-    return items("output", output, _is_writer, wanted)

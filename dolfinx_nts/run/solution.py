@@ -69,15 +69,9 @@ class Solution(Record):
         return contact_fields.functions(body, nodal)
 
     def warn(
-        self,
-        kind: str,
-        time: float,
-        size: float,
-        text: str,
-        *,
-        grave: bool = False,
+        self, kind: str, time: float, size: float, text: str, *, grave: bool = False,
         about: tuple[str, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Add a warning; every rank must make the same call, see `RunWarnings.add`."""
         root, text = self.system.comm.rank == 0, self.worded(text)
         self.warnings.add(kind, time, size, text, grave=grave, about=about, speak=root)
@@ -165,7 +159,7 @@ class Restart(Solution):
     """A run up to a checkpoint, from which it goes on; see `restart`.
 
     Attributes:
-        memory: What its stepper remembers beside, see `Stepper.memory`.
+        memory: What its stepper remembers beside, see `RunMemory`.
         nodal_memory: The same of slave nodes.
         pace: What its steps by `Adapt` remember; None: there were none.
     """

@@ -52,9 +52,10 @@ def check_restart(restart: Restart | None, system: System, time: Any, ledger: bo
 
 
 def refuse_overwritten(system: System) -> None:
-    """Raise a ValueError on every rank if a caller has written into a body's u or v. Collective.
+    """Raise a ValueError on every rank if a caller has written into a body's u, v or mesh.
 
-    A run begins from the body's options or from `start`, so that what was written would be lost.
+    A run begins from the body's options or from `start`, so that what was written would be lost;
+    mass, surfaces and forces would be of different meshes. Collective.
 
     Args:
         system: Its bodies, which hold what a run or their own options wrote last.
@@ -62,16 +63,16 @@ def refuse_overwritten(system: System) -> None:
     for body in system.bodies:
         if body.mesh is None:
             continue
-        found = [f.x.array.copy() for f in (body.u, body.v)]
-        body.accept(*Body.last_accepted(body))
-        here = next(
-            (
-                name
-                for name, values in zip("uv", found, strict=True)
-                if not np.array_equal(getattr(body, name).x.array, values, equal_nan=True)
-            ),
-            None,
+        text = (
+            f"mesh of {body.name!r}: its nodes were moved after the body was made; move them "
+            "before, or pass displacement= to the body"
         )
+        raise_together(system.comm, text if _is_moved(body) else None)
+        found = {name: getattr(body, name).x.array.copy() for name in "uv"}
+        body.accept(*Body.last_accepted(body))
+        both = ((name, getattr(body, name).x.array, old) for name, old in found.items())
+        differ = (name for name, a, b in both if not np.array_equal(a, b, equal_nan=True))
+        here = next(differ, None)
         option = "displacement" if here == "u" else "velocity"
         raise_together(
             system.comm,
@@ -81,10 +82,18 @@ def refuse_overwritten(system: System) -> None:
         )
 
 
-def note_shown(body: Any) -> None:
-    """Keep what a run has just written into a body's u and v, for `refuse_written`."""
-    if body.mesh is not None:
-        body._shown = tuple(f.x.array.copy() for f in (body.u, body.v))
+def accept(system: System, state: State) -> None:
+    """Give bodies a state, and note what their u and v are then, for `refuse_written`."""
+    system.take_inner(state.inner)
+    batches = system.batches
+    ends = (batches.join(values) for values in (state.u, state.v))
+    for body, u, v in zip(batches.bodies, *ends, strict=True):
+        body.accept(u, v)
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        # A body's own `accept` need not call the base's.
+        Body.accept(body, u, v)
+        if body.mesh is not None:
+            body._shown = tuple(f.x.array.copy() for f in (body.u, body.v))
 
 
 def refuse_written(system: System, time: float) -> None:
@@ -121,19 +130,6 @@ def refuse_written(system: System, time: float) -> None:
         for body in system.bodies:
             body.accept(*Body.last_accepted(body))
         raise UserFunctionError(found)
-
-
-def refuse_moved_meshes(system: System) -> None:
-    """Raise a ValueError on every rank if a body's mesh has other places than it was made with.
-
-    Mass, surfaces and forces would be of different meshes. Collective.
-    """
-    for body in system.bodies:
-        text = (
-            f"mesh of {body.name!r}: its nodes were moved after the body was made; move them "
-            "before, or pass displacement= to the body"
-        )
-        raise_together(system.comm, text if _is_moved(body) else None)
 
 
 def _is_moved(body: Body) -> bool:
@@ -340,14 +336,9 @@ def consistent_start(
 
 
 def fitting(
-    problem: StepProblem,
-    state: State,
-    dt: float,
-    *,
-    begun: Solution | None,
-    project: bool,
+    problem: StepProblem, state: State, dt: float, *, begun: Solution | None, project: bool,
     resting: tuple[Newton, Options],
-) -> tuple[State, tuple[float, str] | None]:
+) -> tuple[State, tuple[float, str] | None]:  # fmt: skip
     """The start with rates of prescribed motion and accelerations, which fits the joints.
 
     Collective.

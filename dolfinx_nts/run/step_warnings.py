@@ -43,13 +43,9 @@ _SAG_LEAST = 1e-3
 
 
 def tell_start(
-    solution: Solution,
-    problem: StepProblem,
-    state: State,
-    dt: float,
-    begun: Solution | None,
+    solution: Solution, problem: StepProblem, state: State, dt: float, begun: Solution | None,
     moved: tuple[float, str] | None,
-) -> None:
+) -> None:  # fmt: skip
     """Warn of what a start may not have been meant to be. Collective.
 
     Args:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from itertools import count
 from typing import Any, ClassVar
 
-from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import jumps
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.equations.problem import StepProblem
@@ -18,25 +17,24 @@ from dolfinx_nts.ledger.impact import restored
 from dolfinx_nts.parallel import together
 from dolfinx_nts.petsc_compat import close_at_exit
 from dolfinx_nts.run import step_warnings
-from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
+from dolfinx_nts.run.arguments import check_arguments
 from dolfinx_nts.run.balance_table import Ledger
+from dolfinx_nts.run.between_steps import BetweenSteps, MaterialWatch
 from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.locking_watch import LockingWatch
-from dolfinx_nts.run.material_watch import MaterialWatch
 from dolfinx_nts.run.parts import Parts
 from dolfinx_nts.run.run_file import Saved
+from dolfinx_nts.run.run_memory import RunMemory
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
+    accept,
     check_restart,
     first_state,
     fitting,
     kind_of,
-    note_shown,
     of_file,
-    refuse_moved_meshes,
     refuse_overwritten,
-    refuse_written,
 )
 from dolfinx_nts.run.trial import LastSteps, Trial, solved, state_after
 from dolfinx_nts.solve.accuracy import Newton
@@ -49,7 +47,6 @@ from dolfinx_nts.types import BeforeStep, FloatArray, Options
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
-    call_together,
     known_options,
     require_positive,
 )
@@ -90,6 +87,7 @@ class Stepper:
         problem: Equations of the step, for those who want their parts.
         solver: The SNES that solves them.
         restart: What it goes on from, if that is a `Restart`.
+        memory: What a checkpoint keeps beside state and solution.
         note: Called with what goes on within a step, for those who show it.
     """
 
@@ -113,24 +111,16 @@ class Stepper:
         impact: str = "published",
         restitution: float = 1.0,
     ) -> None:
-        same_run(
-            system, integrator=integrator, newton=newton, petsc_options=petsc_options,
-            start=kind_of(start), start_time=start_time, sleep=sleep,
-            watch_overlap=watch_overlap, before_step=before_step, project_start=project_start,
-            ledger=ledger, impact=impact, restitution=restitution,
+        check_arguments(
+            system, integrator, newton, petsc_options, before_step, impact, restitution,
+            sleep=sleep, watch_overlap=watch_overlap, project_start=project_start, ledger=ledger,
+            start=kind_of(start), start_time=start_time,
         )  # fmt: skip
-        check_scheme(system, integrator, newton, petsc_options)
-        check_run(
-            before_step, sleep=sleep, watch_overlap=watch_overlap, project_start=project_start,
-            ledger=ledger,
-        )  # fmt: skip
-        check_impact(system, integrator, impact, restitution)
         begun: Solution | None = of_file(start, system)
-        given = petsc_options or {}
+        self.system, given = system, petsc_options or {}
         self._restitution = float(restitution) if impact == "restored" else None
-        self._project_start, self._before_step = project_start, before_step
-        self.newton, self._materials = newton or Newton(), MaterialWatch(system)
-        self.interrupts = Interrupts(system.comm)
+        self._project_start, self.newton = project_start, newton or Newton()
+        materials, self.interrupts = MaterialWatch(system), Interrupts(system.comm)
         self._locking = LockingWatch(system, in_time=integrator.inertia)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
@@ -138,7 +128,6 @@ class Stepper:
         )
         self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
         close_at_exit(self)
-        self.system = system
         self.note: Callable[[str], Any] = bool
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._last_steps, self._dampers = LastSteps(), DamperWatch(self.problem)
@@ -146,21 +135,20 @@ class Stepper:
         check_restart(self.restart, system, start_time, ledger)
         self.solution = self.restart.go_on() if self.restart else self.makes(system)
         self.solution.settings = {
-            "integrator": repr(integrator),
-            "newton": repr(self.newton),
+            "integrator": repr(integrator), "newton": repr(self.newton), "sleep": sleep,
             "petsc_options": {name: str(value) for name, value in given.items()},
-            "sleep": sleep,
-            "impact": impact,
-            "restitution": float(restitution),
-            "ranks": system.comm.size,
-        }
-        self._promises = LedgerCheck(self.solution, integrator, self.newton.rtol)
-        self._ledger = Ledger(self.solution, self._promises, kept=ledger)
+            "impact": impact, "restitution": float(restitution), "ranks": system.comm.size,
+        }  # fmt: skip
+        promises = LedgerCheck(self.solution, integrator, self.newton.rtol)
+        self._ledger = Ledger(self.solution, promises, kept=ledger)
+        self._between = BetweenSteps(materials, before_step, self._ledger, self.problem.sleepers)
+        self.memory = RunMemory(
+            self.problem, self.solver, self._last_steps, promises, self._locking
+        )
         self._set_out(begun, start_time)
 
     def _set_out(self, start: Solution | None, start_time: float | None) -> None:
         """Accept the state that the run begins with; arguments are those of the class."""
-        refuse_moved_meshes(self.system)
         refuse_overwritten(self.system)
         state = first_state(self.system, start, start_time)
         if self.problem.integrator.inertia and not (start is not None and start.moving):
@@ -168,54 +156,17 @@ class Stepper:
         if not self.problem.integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
-        self._start = start
-        self._started = False
+        self._start, self._started = start, False
         if self.restart is None:
             self._ledger.open(state, start)
             step_warnings.tell_pieces(self.solution, state.time)
             step_warnings.tell_straight(self.solution, state.time)
 
-    @property
-    def memory(self) -> dict[str, Any]:
-        """What a checkpoint keeps beside state and solution: numbers and tuples of them.
-
-        last: start and length of the last step [s], or None; promised: see `LedgerCheck.memory`;
-        measured: see `Rounding`; recent: lengths of the last two steps [s]; stress: see
-        `LockingWatch.memory`; solver: see `StepSolver.memory`.
-        """
-        return {
-            "last": self._last_steps.last,
-            "promised": self._promises.memory,
-            "measured": self.problem.rounding.measured,
-            "recent": self._last_steps.lengths,
-            "stress": self._locking.memory,
-            "solver": self.solver.memory,
-        }
-
-    @property
-    def nodal_memory(self) -> dict[str, Any]:
-        """The same of slave nodes: of each contact an array at those of this rank.
-
-        unknowns: whether they had any in the last step; force_before: p_N in the step before [N].
-        """
-        found: dict[str, Any] = {"unknowns": self.problem.couplings.contacts.had_unknowns}
-        if (force := self._last_steps.force_before) is not None:
-            found["force_before"] = force
-        return found
-
     def _resume(self, restart: Restart, dt: float) -> None:
         """Begin where a checkpoint was written, with the materials of its last step."""
-        memory, nodal = restart.memory, restart.nodal_memory
-        self._last_steps.resume(memory, nodal, self.state)
-        self.problem.couplings.contacts.resume(nodal["unknowns"])
-        self._promises.resume(memory["promised"])
-        self.problem.rounding.measured = memory["measured"]
-        self.solver.resume(memory["solver"])
-        self._locking.resume(memory["stress"])
+        self.memory.resume(restart.memory, restart.nodal_memory, self.state)
         if self._last_steps.last is not None:
-            begin, length = self._last_steps.last
-            self._call_before(length, begin)
-        self._materials.changed()
+            self._between.begin(*self._last_steps.last)
         what = "what the restart was given in place of the checkpoint's materials"
         self._ledger.restate(self.state, what, beyond=_SAME)
         if self.problem.integrator.accelerations and not self.state.a:
@@ -251,10 +202,6 @@ class Stepper:
 
     def in_parts(self, dt: float, *, end: float | None = None) -> Iterator[bool]:
         """`advance`, stopping after every accepted step: dt, or the parts that it is cut into.
-
-        Args:
-            dt: Time to advance [s], > 0.
-            end: Time there [s].
 
         Yields:
             Whether this was the last part.
@@ -298,7 +245,12 @@ class Stepper:
             return
         for retry in count():
             try:
-                state, moved = self._fitting(dt)
+                # What the first call sets is what the run begins with.
+                self._between.begin(self.state.time, dt)
+                state, moved = fitting(
+                    self.problem, self.state, dt, begun=self._start, project=self._project_start,
+                    resting=(self.newton, self._given),
+                )  # fmt: skip
                 break
             except UserFunctionError:
                 raise
@@ -314,21 +266,6 @@ class Stepper:
         self._ledger.open(state, self._start)
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
-
-    def _fitting(self, dt: float) -> tuple[State, tuple[float, str] | None]:
-        """The start with rates of prescribed motion and accelerations, which fits the joints.
-
-        Returns:
-            As `fitting` does.
-
-        Raises:
-            StepFailedError: A joint refuses a step of this length.
-        """
-        self._call_before(dt)
-        # What the first call sets is what the run begins with.
-        self._materials.changed()
-        project, resting, begun = self._project_start, (self.newton, self._given), self._start
-        return fitting(self.problem, self.state, dt, begun=begun, project=project, resting=resting)
 
     def look(self, *, last: bool = False) -> None:
         """Warn if what is in contact is inside each other; only as often as it has moved.
@@ -347,15 +284,7 @@ class Stepper:
             step_warnings.tell_overlap(self.solution, self._overlap, self.state, last=last)
 
     def _accept(self, state: State) -> None:
-        self.system.take_inner(state.inner)
-        batches = self.system.batches
-        ends = (batches.join(values) for values in (state.u, state.v))
-        for body, u, v in zip(batches.bodies, *ends, strict=True):
-            body.accept(u, v)
-        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
-            # A body's own `accept` need not call the base's.
-            Body.accept(body, u, v)
-            note_shown(body)
+        accept(self.system, state)
         self.state = self.solution.state = state
 
     def _step(self, dt: float, time: float) -> None:
@@ -364,32 +293,8 @@ class Stepper:
 
     def begin(self, dt: float) -> None:
         """Fix the equations of a step from the last accepted state."""
-        self._prepare(dt)
+        self._between.prepare(self.state, dt)
         self.problem.begin(self.state, dt)
-
-    def _prepare(self, dt: float) -> None:
-        """Let the user change what the forms of the step hold, and account for it."""
-        self._call_before(dt)
-        self._note_materials()
-
-    def _call_before(self, dt: float, time: float | None = None) -> None:
-        if self._before_step is not None:
-            time = self.state.time if time is None else time
-            name = f"before_step at t={time!r} with dt={dt!r}"
-            call_together(self.system.comm, name, self._before_step, time, dt)
-        self.refuse_written()
-
-    def refuse_written(self) -> None:
-        """Raise a UserFunctionError if something else has written into a body's u or v."""
-        refuse_written(self.system, self.state.time)
-
-    def _note_materials(self) -> None:
-        """Name in the ledger what changed parameters of materials do to the energy."""
-        names = self._materials.changed()
-        if names:
-            self.problem.sleepers.forget()
-            what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
-            self._ledger.restate(self.state, what, beyond=0.0)
 
     def attempt(self, time: float) -> Trial:
         """Solution of the step that `begin` fixed, if it may be accepted.

@@ -158,7 +158,7 @@ class LastSteps:
     def resume(
         self, memory: Mapping[str, Any], nodal: Mapping[str, Any], state: State
     ) -> None:
-        """Remember what a checkpoint holds, see `Stepper.memory` and `Stepper.nodal_memory`."""
+        """Remember what a checkpoint holds, see `RunMemory`."""
         forces = [tuple(nodal["force_before"])] if "force_before" in nodal else []
         forces.append(_forces(state))
         self._recent.extend(zip(memory["recent"], forces, strict=False))

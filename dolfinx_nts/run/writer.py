@@ -1,8 +1,12 @@
-"""What a run asks of a writer."""
+"""What a run asks of writers, and how it does on all ranks alike."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
+
+from dolfinx_nts.parallel import first_problem
+from dolfinx_nts.validation import items
 
 if TYPE_CHECKING:
     from dolfinx_nts.run.stepper import Stepper
@@ -30,3 +34,36 @@ class Writer(Protocol):
 
     def close(self, stepper: Stepper) -> Any:
         """Called once at the end, also of a run that failed: see `stepper.solution.status`."""
+
+
+def call_here(
+    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
+) -> tuple[str | None, Exception | None]:
+    """Call a method of all writers, also when one raises: what the first raised here, and it."""
+    problem, cause = None, None
+    for k, writer in enumerate(output):
+        try:
+            getattr(writer, name)(stepper, **options)
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            if cause is None:
+                what = f"output[{k}] ({type(writer).__name__}): {name}"
+                what += f" at t={stepper.state.time!r} raised {error!r}"
+                problem, cause = f"{what}; correct it, or leave this writer out", error
+    return problem, cause
+
+
+def call_writers(
+    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
+) -> tuple[str | None, Exception | None]:
+    """`call_here` with the first problem of any rank, on all ranks alike. Collective."""
+    problem, cause = call_here(stepper, output, name, **options)
+    return first_problem(stepper.system.comm, problem), cause
+
+
+def writers(output: Any) -> tuple[Writer, ...]:
+    """The argument `output`, checked."""
+    wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
+    asked = "start", "write", "close"
+    return items(
+        "output", output, lambda w: all(callable(getattr(w, name, None)) for name in asked), wanted
+    )

@@ -60,11 +60,9 @@ class AugmentedMatrix:
     """
 
     def __init__(
-        self,
-        problem: StepProblem,
-        bodies: Sequence[Body],
+        self, problem: StepProblem, bodies: Sequence[Body],
         around: Callable[[Any], FloatArray] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         laid, batches = problem.laid, problem.batches
         blocks = [b._replace(pattern=np.ones_like(b.pattern)) for b in laid.blocks]
         self.matrix = StepMatrix(laid.layout, bodies, blocks, split=True, blocked=True, kind="aij")

@@ -116,9 +116,7 @@ class BlurredContacts:
         return self._blurred(x), True
 
     def _begins(
-        self,
-        batches: Sequence[ContactElements],
-        both: Sequence[tuple[Contribution, Contribution]],
+        self, batches: Sequence[ContactElements], both: Sequence[tuple[Contribution, Contribution]]
     ) -> bool:
         """Choose the widths; whether there is anything to blur. Collective.
 

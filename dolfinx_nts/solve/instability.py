@@ -84,7 +84,7 @@ def _turns(problem: StepProblem, step: Evaluation) -> Any:
     along which the constraints' forces turn, such as the spin of a string.
     """
     parts = []
-    for k in sorted(problem.awake, key=lambda k: problem.of_body(k).start):
+    for k in sorted(problem.awake, key=lambda k: problem.laid.of_body(k).start):
         body = problem.system.bodies[k]
         x = (body.reference + step.bodies[k].u1).reshape(-1, 3)
         nodes = int(body.places.sum())
@@ -153,7 +153,7 @@ def _no_stiffness(
     size, found = np.abs(diagonal.array_r), np.zeros(len(turning))
     diagonal.destroy()
     for row, k in enumerate(problem.awake):
-        body, here = problem.system.bodies[k], problem.of_body(k)
+        body, here = problem.system.bodies[k], problem.laid.of_body(k)
         found[here] = (
             _of_rigid(body, size[here], turning[here]) if body.rigid
             else _NONE * size[here] + left[row]

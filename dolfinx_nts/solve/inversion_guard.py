@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import compress
+
 import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.solid.inversion import describe, forbidden, smallest_dets
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.types import FloatArray
 
 #: An update that would leave less than this part of the smallest det F of a body is halved, ...
@@ -116,8 +119,9 @@ class InversionGuard:
         """Displacement of each body at an iterate [m]; the array of t_n if it stays. Collective."""
         problem, u = self._problem, list(self._problem.state.u)
         places = problem.displacements(x)
-        moved = problem.elsewhere(places, dict(enumerate(problem.batches.join(u))))
+        moves = problem.laid.moves(places, dict(enumerate(problem.batches.join(u))))
         now = problem.batches.split(places)
-        for k in (k for j in moved for k in problem.batches.numbers[j]):
-            u[k] = now[k]
+        for j in compress(problem.laid.awake, global_max(problem.system.comm, np.array(moves))):
+            for k in problem.batches.numbers[j]:
+                u[k] = now[k]
         return u

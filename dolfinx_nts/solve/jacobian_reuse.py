@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.evaluation import Evaluation
 
 #: Relative difference of the factors of two equal steps of a caller whose lengths are rounded.
@@ -31,7 +32,7 @@ class KeptTangents:
         self.due, self._factor = True, 0.0
         self._matrices: dict[int, Any] = {}
         self._states: dict[int, int] = {}
-        self._version = -1
+        self._laid: Unknowns | None = None
 
     def begin(self) -> None:
         """Begin a step: matrices of another step size are of no use."""
@@ -47,11 +48,11 @@ class KeptTangents:
         """
         problem = self._problem
         awake = problem.laid.awake
-        if self._version != problem.version:
+        if self._laid is not problem.laid:
             # Which bodies of a batch are awake may have changed.
             for j in range(len(problem.batches.several)):
                 self._matrices.pop(j, None)
-            self._version = problem.version
+            self._laid = problem.laid
         # PETSc counts the same on all ranks, as it relies on that itself.
         changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
         fresh = self.due or changed

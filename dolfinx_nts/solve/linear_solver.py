@@ -195,14 +195,9 @@ class SolverOptions:
     """
 
     def __init__(
-        self,
-        comm: MPI.Comm,
-        preset: str,
-        condense: bool,
-        given: Options,
-        limit: int | None = None,
+        self, comm: MPI.Comm, preset: str, condense: bool, given: Options, limit: int | None = None,
         workspace: int | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._comm, self._given = comm, dict(given)
         known = dict(PRESETS[preset])
         if preset == "krylov" and comm.size > 1:
@@ -270,14 +265,9 @@ class SolverOptions:
         return self.blocked and not self.augmented
 
     def configure(
-        self,
-        snes: PETSc.SNES,
-        matrix: StepMatrix | None,
-        num_bodies: int,
-        *,
-        whole: bool = False,
+        self, snes: PETSc.SNES, matrix: StepMatrix | None, num_bodies: int, *, whole: bool = False,
         mixed: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Set a SNES up from the options.
 
         Without constraints a field split has one part only, so the bodies' options are used.

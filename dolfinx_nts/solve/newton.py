@@ -1,4 +1,4 @@
-"""PETSc SNES for a step: attempts at it, and when it counts as solved."""
+"""PETSc SNES for a step, and attempts at it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import NO_DIRECTION
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.solve.accuracy import EXACT, Newton
-from dolfinx_nts.solve.convergence import leaves_work, worst
+from dolfinx_nts.solve.accuracy import Newton
+from dolfinx_nts.solve.convergence_test import ConvergenceTest
 from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
 from dolfinx_nts.solve.inversion_guard import InversionGuard
 from dolfinx_nts.solve.iterates import Iterates
@@ -29,24 +29,6 @@ from dolfinx_nts.types import Options
 from dolfinx_nts.validation import StepFailedError
 
 logger = logging.getLogger(__name__)
-
-
-#: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
-_SLOW = 0.05
-#: A residual that keeps more than this part of itself in an iteration ...
-_STALLED = 0.5
-#: ... and is at most this many tolerances large may be the rounding of forces that have grown since
-#: rounding was measured.
-_NEAR = 1e4
-#: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
-#: hardly ever comes back, and most steps never get there.
-_INSIDE_OUT = 8
-#: Iterations before an attempt whose contacts go to and fro ends, where another way is left.
-_CYCLING = 8
-#: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
-_SURE = 0.05
-#: The part of the tolerance by which work may be left where it has either sign.
-_EITHER_SIGN = 0.02
 
 
 class StepSolver:
@@ -74,9 +56,11 @@ class StepSolver:
         self._jacobian = StepJacobian(problem, self._presets)
         self._tangents = self._jacobian.tangents
         self.iterates, self._upright = Iterates(problem), InversionGuard(problem)
-        self._lent, self._wanders = LentStiffness(problem), False
-        self._passed: Evaluation | None = None
-        self._version, self._solved, self._patient = -1, False, True
+        self._test = ConvergenceTest(
+            problem, newton, self._presets, self._tangents, self.iterates, self._upright
+        )
+        self._lent = LentStiffness(problem)
+        self._laid: Unknowns | None = None
         self._raised: StepFailedError | None = None
         self._repeats = Redundancy(problem)
         self.snes: PETSc.SNES = None
@@ -114,7 +98,7 @@ class StepSolver:
             last = self._attempt()
             iterations += last.iterations
             if not self.problem.wake(last):
-                found = self._repeats.of_least_norm(last, self._worst)
+                found = self._repeats.of_least_norm(last, self._test.worst)
                 return replace(found, iterations=iterations)
 
     def _attempt(self) -> Evaluation:
@@ -130,7 +114,7 @@ class StepSolver:
             if first < 0 == retry and not self.iterates.runs_away:
                 continue
             slides = may_slip and retry == (-1 if first < 0 else 1)
-            self._patient = moves or not may_slip or retry != 0 or first < 0
+            self._test.patient = moves or not may_slip or retry != 0 or first < 0
             # Where nothing carries yet, too many nodes touch at first and press cells flat.
             careful = retry != first + 1 if starts else retry > 0
             self._begin(retry, careful, slides=slides, again=retry > first, unsolved=unsolved)
@@ -155,10 +139,10 @@ class StepSolver:
                     "contact and a support, may hold the same nodes"
                 ) from error
             self._lent.begin()
-            last = self._passed or self.iterates.at(self.problem.x)
+            last = self._test.passed or self.iterates.at(self.problem.x)
             iterations += self.snes.getIterationNumber()
             # A solver of the user's may stop SNES by its own tests; ours decide.
-            solved = last is self._passed or self._worst(last) <= 1.0
+            solved = last is self._test.passed or self._test.worst(last) <= 1.0
             reason = self.snes.getConvergedReason()
             if solved and reason > 0:
                 dets = self._upright.smallest(last.x)
@@ -188,7 +172,7 @@ class StepSolver:
         """
         self._upright.begin(careful=careful or self.problem.dives)
         if again:
-            self._tangents.due, self._passed = True, None
+            self._tangents.due, self._test.passed = True, None
             if retry == 0:
                 self.problem.first_guess()
             else:
@@ -223,22 +207,21 @@ class StepSolver:
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
         self.iterates.restart()
-        self._passed, self._measured, self._before = None, False, np.inf
+        self._test.begin()
         self._lent.begin()
-        self._wanders = False
         self._tangents.begin()
-        if self._version != self.problem.version:
+        if self._laid is not self.problem.laid:
             self.destroy()
             self.assemble(self.iterates.at(self.problem.x))
             self._configure()
-            self._version = self.problem.version
+            self._laid = self.problem.laid
 
     def assemble(self, e: Evaluation) -> StepMatrix:
         """Jacobian at an iterate, as SNES sees it. Every rank must call it.
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
-        return self._jacobian.assemble(e, self.snes, solved=self._solved)
+        return self._jacobian.assemble(e, self.snes, solved=self._test.solved)
 
     @property
     def matrix(self) -> StepMatrix | None:
@@ -251,10 +234,10 @@ class StepSolver:
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)
         self.snes.setJacobian(self._at_iterate, *self._jacobian.operators)
-        self.snes.setConvergenceTest(self._converged)
+        self.snes.setConvergenceTest(self._test)
         self.snes.setLineSearchPreCheck(self._check_update)
         self.snes.setTolerances(max_it=2 * self.newton.max_iterations)
-        self._solved = False
+        self._test.solved = False
         self._jacobian.configure(self.snes)
 
     # ---- SNES callbacks
@@ -268,7 +251,7 @@ class StepSolver:
     def _at_iterate(self, _snes: Any, x: PETSc.Vec, _j: Any, _p: Any) -> None:
         e = self.iterates.at(x)
         if e is not self._jacobian.assembled:
-            if self._lent.at(e, wanders=self._wanders):
+            if self._lent.at(e, wanders=self._test.wanders):
                 self._tangents.due = True
             self.assemble(e)
 
@@ -276,84 +259,6 @@ class StepSolver:
         """Hold prescribed coordinates, which a multigrid moves a little, and shorten updates."""
         y.array_w[self.problem.laid.held] = 0.0
         return self._upright.shorten(x, y)
-
-    def _worst(self, e: Evaluation) -> float:
-        return self._look(e)[0]
-
-    def _look(self, e: Evaluation, *flags: bool) -> tuple[float, list[bool]]:
-        """What `worst` finds. Collective."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            found, flagged = worst(self.problem, e, *flags)
-        # What contacts satisfy that are held as they are not is no solution.
-        imposed = e is self.iterates.last and self.iterates.imposed
-        return max(found, 2.0) if imposed else found, flagged
-
-    def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
-        last, x = self.iterates.last, snes.getSolution()
-        assert last is not None
-        reasons, elsewhere = PETSc.SNES.ConvergedReason, not np.array_equal(x.array_r, last.x)
-        acts = any(bool(part.status.any()) for part in last.parts)
-        found = self._look(last, not self.iterates.settled, elsewhere, acts)
-        worst, (changed, elsewhere, acts) = found
-        unchanged = not changed
-        if not elsewhere:
-            # Here SNES asks for the Jacobian next.
-            self.iterates.known.append((x, x.stateGet()))
-        if not np.isfinite(norms[2]) or not np.isfinite(worst):
-            return reasons.DIVERGED_FNORM_NAN
-        stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
-        if stalls and not self._measured:
-            # An active set that still changes stalls by itself, not by rounding.
-            if worst < _NEAR or (unchanged and not self.problem.rounding_is_known):
-                self.problem.measure_rounding(last)
-                self._measured = True
-                worst = self._worst(last)
-        self._solved |= iteration > 0
-        self._tangents.due |= unchanged and worst > max(1.0, _SLOW * self._before)
-        if iteration > 0 and unchanged:
-            self._presets.learn(worst, self._before)
-        self._wanders = iteration > 0 and (not unchanged or worst > self._before)
-        self._before = worst
-        # Where friction of joints is blurred, iterates lead to a first guess, and have as many.
-        allowed = self.newton.max_iterations
-        allowed += min(self.iterates.led, allowed)
-        if worst <= 1.0:
-            enough = self._passed is not None or iteration >= allowed
-            self._passed = last
-            if enough or worst <= _SURE or not self._adds_up(last, acts):
-                return reasons.CONVERGED_FNORM_RELATIVE
-        elif self._passed is not None:
-            # One more iteration left rounding only: what it started from is the solution.
-            return reasons.CONVERGED_FNORM_RELATIVE
-        late = iteration > 0 and iteration % _INSIDE_OUT == 0
-        in_vain = self.iterates.runs_away or self._upright.gives_up
-        # In statics what slides first hardly ever fails.
-        in_vain |= not self._patient and iteration >= _CYCLING and self.iterates.cycles
-        if in_vain or (late and self._is_inside_out(last)):
-            return reasons.DIVERGED_FUNCTION_DOMAIN
-        if iteration >= allowed:
-            return reasons.DIVERGED_MAX_IT
-        self._presets.aim(self.snes, worst)
-        return reasons.ITERATING
-
-    def _is_inside_out(self, e: Evaluation) -> bool:
-        return not self._upright.accepts(self._upright.smallest(e.x))
-
-    def _adds_up(self, e: Evaluation, acts: bool) -> bool:
-        """Whether what an iteration leaves adds up over steps; every rank must call it.
-
-        Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
-        where contact acts, the parts differ, and only what is much in one step counts.
-
-        Args:
-            e: Iterate that may be the solution.
-            acts: Whether any contact acts in it.
-        """
-        problem, rtol = self.problem, self.newton.rtol
-        if self._presets.keeps and (rtol <= EXACT or not acts):
-            return True
-        # Where nothing has inertia there is no ledger.
-        return problem.integrator.inertia and leaves_work(problem, e, _EITHER_SIGN * rtol)
 
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
@@ -401,4 +306,4 @@ class StepSolver:
             self.snes.destroy()
             self._f.destroy()
             self.snes = None
-        self._version = -1
+        self._laid = None

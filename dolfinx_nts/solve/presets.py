@@ -68,14 +68,9 @@ class Presets:
     """
 
     def __init__(
-        self,
-        system: System,
-        newton: Newton,
-        first: str,
-        given: Options,
-        condense: bool,
+        self, system: System, newton: Newton, first: str, given: Options, condense: bool,
         inertia: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._system, self._newton, self._given = system, newton, given
         self._condense, self._patience = condense, 0
         self._keeps = newton.keeps(system, inertia)

@@ -38,7 +38,7 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     comm, bodies = problem.system.comm, problem.system.bodies
     direction, result = problem.x.duplicate(), problem.x.duplicate()
     diagonal = operator.getDiagonal()
-    local = [np.abs(diagonal.array_r[problem.of_body(k)]).max(initial=0.0)
+    local = [np.abs(diagonal.array_r[problem.laid.of_body(k)]).max(initial=0.0)
              for k in range(len(bodies))]  # fmt: skip
     stiffness = global_max(comm, np.array(local))
     stiffness[stiffness == 0.0] = stiffness.max() or 1.0
@@ -50,7 +50,7 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
         spins += [False] * 5 + [straight]
         for shape in shapes:
             direction.set(0.0)
-            direction.array_w[problem.of_body(k)] = shape / stiffness[k]
+            direction.array_w[problem.laid.of_body(k)] = shape / stiffness[k]
             operator.mult(direction, result)
             modes.append((k, shape))
             images.append(result.array_r.copy())
@@ -67,11 +67,11 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
         # The matrix has the squares of resistances, which keep half the digits of these.
         direction.set(0.0)
         for part, (k, mode) in zip(combination, modes, strict=True):
-            direction.array_w[problem.of_body(k)] += part / stiffness[k] * mode
+            direction.array_w[problem.laid.of_body(k)] += part / stiffness[k] * mode
         operator.mult(direction, result)
         resistance: float = result.norm()
         for k, value in enumerate(stiffness):
-            direction.array_w[problem.of_body(k)] *= value
+            direction.array_w[problem.laid.of_body(k)] *= value
         return resistance > _NONE * direction.norm()
 
     spin, found = np.array(spins), None

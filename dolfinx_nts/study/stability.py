@@ -152,12 +152,9 @@ def measure(
 
 
 def chart(
-    only: Sequence[str] = (),
-    integrators: Sequence[str] = (),
-    accuracy: Sequence[str] = (),
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    told: Callable[[Rows], None] = lambda _: None,
-) -> Rows:
+    only: Sequence[str] = (), integrators: Sequence[str] = (), accuracy: Sequence[str] = (),
+    comm: MPI.Comm = MPI.COMM_WORLD, told: Callable[[Rows], None] = lambda _: None,
+) -> Rows:  # fmt: skip
     """Rows of all runs of some axes.
 
     Args:

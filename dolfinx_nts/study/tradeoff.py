@@ -50,12 +50,9 @@ def grid(vary: Mapping[str, Sequence[Any]]) -> Rows:
 
 
 def compare(
-    scene: str,
-    vary: Mapping[str, Sequence[Any]],
-    fixed: BalanceRow,
-    reference: BalanceRow,
+    scene: str, vary: Mapping[str, Sequence[Any]], fixed: BalanceRow, reference: BalanceRow,
     comm: MPI.Comm,
-) -> Rows:
+) -> Rows:  # fmt: skip
     """Rows of all runs, the reference first.
 
     Args:

@@ -37,7 +37,7 @@ def bar(cells, poisson, *, height=1.0, kind=CellType.hexahedron, **options):
 )  # fmt: skip
 def test_jumps_of_the_stress(cells, poisson, options, share):
     body, run = bar(cells, poisson, **options)
-    jumps, whole = body.stress_jumps()
+    jumps, whole = body.locking.stress_jumps()
     assert jumps / whole == pytest.approx(share, rel=0.05)
     assert ("locking" in run.warnings) == (share > 0.1)
 
@@ -71,7 +71,7 @@ def test_a_wave_is_no_locking():
     shares = []
     for _ in range(80):
         s.advance(5e-4)
-        jumps, whole = body.stress_jumps()
+        jumps, whole = body.locking.stress_jumps()
         shares.append(jumps / whole if whole else 0.0)
     s.look(last=True)
     steps, sums = s._locking.memory
@@ -112,7 +112,7 @@ def test_degree_2_is_sound():
 def test_a_bush_that_cannot_change_its_volume_is_told_of():
     """Held at both faces its stress hardly jumps, while it is 100 times too stiff."""
     body, run = held_block(0.4999)
-    jumps, whole = body.stress_jumps()
+    jumps, whole = body.locking.stress_jumps()
     assert jumps / whole < 0.5 and "hardly changes its volume" in run.warnings["locking"].text
     _, run = held_block(0.4999, volume="projected")
     assert "hardly changes" not in str(run.warnings.get("locking"))
@@ -145,7 +145,7 @@ def test_thin_whatever_way_it_is_turned(angle, sides, cells, thin):
     mesh = create_box(COMM, (np.zeros(3), np.array(sides, float)), cells, CellType.hexahedron)
     mesh.geometry.x[:] = mesh.geometry.x @ rotation(angle, (1.0, 2.0, 3.0)).T
     body = nts.Continuum(mesh, nts.NeoHookean(young=1.0, poisson=0.3), density=1.0)
-    assert body.is_thin == thin
+    assert body.locking.is_thin == thin
 
 
 @pytest.mark.mpi

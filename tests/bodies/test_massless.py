@@ -320,7 +320,7 @@ def test_jacobian(rule, friction):
     assert 0 < evaluation.parts[0].active.sum() < len(gap)
     assert (problem.elements[0].law.before[:, 0] < 0.0).any()
     stepper.solver.assemble(evaluation)
-    x, step, count = problem.x.array_r.copy(), 1e-4, problem.unknowns.layout.counts.shape[1]
+    x, step, count = problem.x.array_r.copy(), 1e-4, problem.laid.layout.counts.shape[1]
     expected = np.zeros((len(x), len(x)))
     for j in range(len(x)):
         for k, weight in STENCIL:
@@ -329,7 +329,7 @@ def test_jacobian(rule, friction):
             other.array_w[j] += k * step
             expected[:, j] += weight / step * problem.residual(problem.evaluate(other))
             other.destroy()
-    blocks = [problem.unknowns.layout.owned(f) for f in range(count)]
+    blocks = [problem.laid.layout.owned(f) for f in range(count)]
     errors = block_errors(dense(stepper.solver.matrix.operator), expected, blocks)
     stepper.close()
     assert max(errors.values()) < 1e-8, errors

@@ -261,7 +261,7 @@ def test_the_stiffness_of_nodes_is_that_of_changed_moduli():
     mesh = box(cells=(1, 1, 1))
     body = nts.Continuum(mesh, nts.NeoHookean(YOUNG, POISSON), density=DENSITY)
     before = body.nodal_stiffness()
-    (moduli,) = (t for t in body._parameters if t.ufl_shape == (2,))
+    (moduli,) = (t for t in body._parameters.all if t.ufl_shape == (2,))
     moduli.value = 3 * moduli.value
     body.take_parameters()
     np.testing.assert_allclose(body.nodal_stiffness(), 3 * before, rtol=1e-13)

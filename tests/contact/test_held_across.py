@@ -122,7 +122,7 @@ def at_rest(shape):
     problem = StepProblem(run.system, Static(), rtol=1e-12, condense=False)
     problem.begin(run.state, 0.0)
     (contact,) = problem.elements
-    (x,) = problem.unknowns.positions(problem.x, problem.elements)
+    (x,) = problem.laid.positions(problem.x, problem.elements)
     node = contact.candidates.node
     force, tangential = run.state.contacts[0].force[node], run.state.contacts[0].tangential[node]
     multiplier = contact.multipliers(force, tangential) / contact.law.scale[:, None]

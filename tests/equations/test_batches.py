@@ -120,7 +120,7 @@ def begun(system, integrator, seed=3):
     moved = noise(1e-2)
     with problem.x as x:
         for k, own in enumerate(moved):
-            x[problem.of_body(k)] += own
+            x[problem.laid.of_body(k)] += own
     return problem, problem.evaluate(problem.x)
 
 

@@ -180,7 +180,7 @@ def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
         assert s.state.u[3] is s.problem.state.u[3] and 3 not in s.problem.awake
         assert searched.count(system.contacts[2]) <= 1 or 2 in s.problem.awake
     assert s.problem.awake == (0, 1, 2) and searched.count(system.contacts[0]) > 1
-    fields = s.problem.unknowns.layout.counts.sum(axis=0)
+    fields = s.problem.laid.layout.counts.sum(axis=0)
     assert list(fields[:3]) == [COMM.allreduce(b.num_owned) for b in system.bodies[:3]]
     s.close()
 

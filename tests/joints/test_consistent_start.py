@@ -184,7 +184,7 @@ def test_joints_know_how_far_their_mechanism_reaches():
     problem.begin(problem.system.initial_state(), 1e-3)
     with problem.x as x:
         for k in (0, 1):
-            x[problem.of_body(k)][:3] += 1e-13
+            x[problem.laid.of_body(k)][:3] += 1e-13
     found = ratios(problem, problem.evaluate(problem.x))
     # Eight roundings of each of the two places that meet.
     limit = 16.0 * np.finfo(float).eps * 1e4

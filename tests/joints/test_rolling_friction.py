@@ -294,7 +294,7 @@ def test_matrix_is_the_derivative_of_the_residual(rule):
         direction.array_w[:] = values
         return problem.residual(problem.evaluate(direction))
 
-    bodies, multipliers = problem.of_body(0), problem.laid.of_elements("constraints")
+    bodies, multipliers = problem.laid.of_body(0), problem.laid.of_elements("constraints")
     # Rows of contact lend compliances, which depend on what is missed.
     (batch,) = (e for e in problem.elements if e.name == law.name)
     rows = np.r_[bodies, multipliers.stop - 3 * batch.num_elements : multipliers.stop]

@@ -80,7 +80,7 @@ class Linearised:
         problem.begin(state, dt)
         self.solver = self.stepper.solver
         rng = np.random.default_rng(COMM.rank)
-        layout = problem.unknowns.layout
+        layout = problem.laid.layout
         fields = range(len(system.bodies), layout.counts.shape[1])
         with problem.x as x:
             for k, body in enumerate(system.bodies):
@@ -120,8 +120,8 @@ class Linearised:
         self.stepper.close()
 
     def blocks(self):
-        fields = range(self.problem.unknowns.layout.counts.shape[1])
-        return [self.problem.unknowns.layout.owned(f) for f in fields]
+        fields = range(self.problem.laid.layout.counts.shape[1])
+        return [self.problem.laid.layout.owned(f) for f in fields]
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
@@ -207,7 +207,7 @@ def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
     at = Linearised(system, rule, "mixed", rotated_state(system, 0.1, fixed=True))
-    offset = at.problem.unknowns.layout.owned(1).start
+    offset = at.problem.laid.layout.owned(1).start
     fixed = offset + system.bodies[1].fixed
     assert len(fixed) == 18
     matrix, x, step = dense(at.solver.matrix.operator), at.problem.x.array_r.copy(), 1e-4

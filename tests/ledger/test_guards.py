@@ -119,12 +119,12 @@ def test_no_tolerance_comes_from_an_iterate():
     stepper.start(STEP)
     problem = stepper.problem
     problem.begin(stepper.state, 2e-3)
-    before = problem.momentum_rounding
+    before = problem.rounding.forces.tolist()
     far = problem.x.duplicate()
     far.array_w[:] = 1e3 * (1 + np.arange(len(far.array_r)))
     with np.errstate(all="ignore"):
         problem.tangents.at(problem.evaluate(far))
-    assert problem.momentum_rounding == before
+    assert problem.rounding.forces.tolist() == before
     far.destroy()
     stepper.close()
 

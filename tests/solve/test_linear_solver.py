@@ -313,9 +313,9 @@ def test_matrix_in_blocks_of_nodes(cells, masters):
     problem = stepper.problem
     e = problem.evaluate(problem.x)
     other = StepMatrix(
-        problem.unknowns.layout, problem.tangents.at(e), problem.unknowns.blocks, split=True
+        problem.laid.layout, problem.tangents.at(e), problem.laid.blocks, split=True
     )
-    tangents = [part.tangent for part in e.parts] if problem.unknowns.blocks else []
+    tangents = [part.tangent for part in e.parts] if problem.laid.blocks else []
     matrix.assemble(tangents, fresh=True)
     other.assemble(tangents)
     x, y, z = (problem.x.duplicate() for _ in range(3))

@@ -138,11 +138,11 @@ def test_far_bodies_have_neither_search_nor_contact_unknowns(monkeypatch, integr
 
     monkeypatch.setattr(search, "closest_facets", called)
     far.advance(scenes.dt)
-    version = far.problem.version
+    laid = far.problem.laid
     for _ in range(3):
         far.advance(scenes.dt)
-    assert far.problem.version == version
-    assert far.problem.unknowns.layout.counts.shape[1] == 2 and not far.problem.unknowns.blocks
+    assert far.problem.laid is laid
+    assert far.problem.laid.layout.counts.shape[1] == 2 and not far.problem.laid.blocks
     row, u = far.solution.rows[-1], displacements(far)
     far.close()
     alone = stepper(scenes.system(FEATURE["contact not declared"]), integrator)
@@ -177,10 +177,10 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
     feature = dataclasses.replace(FEATURE["candidates, inactive"], friction=friction)
     near = stepper(scenes.system(feature), integrator)
     near.advance(scenes.dt)
-    version = near.problem.version
+    laid = near.problem.laid
     near.advance(scenes.dt)
     assert num_idle(near) == 9
-    assert near.problem.version == version and near.problem.unknowns.layout.counts.shape[1] == 2
+    assert near.problem.laid is laid and near.problem.laid.layout.counts.shape[1] == 2
     fill, near_row = factor_entries(near), near.solution.rows[-1]
     near.close()
 
@@ -271,7 +271,7 @@ def test_frictionless_contact_has_no_tangential_unknowns():
     for name in ("active", "friction, active"):
         s = stepper(scenes.system(FEATURE[name]))
         s.advance(scenes.dt)
-        counts.append(int(s.problem.unknowns.layout.counts[:, 2:].sum()))
+        counts.append(int(s.problem.laid.layout.counts[:, 2:].sum()))
         s.close()
     assert counts == [9, 9 * 3]
 

@@ -185,13 +185,10 @@ def bodies_from_gmsh(
 
 
 def bodies_from_tags(
-    mesh: Mesh,
-    cell_tags: Any,
-    facet_tags: Any = None,
-    *,
+    mesh: Mesh, cell_tags: Any, facet_tags: Any = None, *,
     names: Mapping[str, int | Sequence[int]] | None = None,
     surfaces: Mapping[str, int] | None = None,
-) -> Parts:
+) -> Parts:  # fmt: skip
     """One mesh per cell tag of a DOLFINx mesh.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from itertools import compress
 from typing import Any
 
 from mpi4py import MPI
@@ -13,12 +14,13 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
+from dolfinx_nts.bodies.conditions import VectorInTime
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
 from dolfinx_nts.bodies.nodal_values import motion_on
 from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
-from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads, VectorInTime
+from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads
 from dolfinx_nts.bodies.rigid.rigid_matrix import RigidMatrix
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
@@ -72,10 +74,8 @@ class RigidBody(MeshBody):
         mass: [kg].
         moments: Principal moments of inertia [kg m^2], shape (3,).
         centre: Centre of mass in the reference [m], shape (3,).
-        u: Displacement of the mesh [m], dolfinx Function of the last accepted state; of a body with
-            a mesh, as are the next ones.
-        v: Velocity of the mesh [m/s], dolfinx Function.
-        space: Their function space.
+        u: Displacement of the mesh [m], dolfinx Function of the last accepted state; v and space
+            alike.
 
     Raises:
         TypeError: `mesh` is none, or an argument is of another kind.
@@ -173,18 +173,10 @@ class RigidBody(MeshBody):
         return body
 
     def _set_up(
-        self,
-        comm: MPI.Comm,
-        inertia: Inertia,
-        *,
-        name: str,
-        velocity: Values,
-        angular_velocity: Values,
-        force: VectorInTime,
-        torque: VectorInTime,
-        motion: VectorInTime | None,
-        rotation: Any,
-    ) -> None:
+        self, comm: MPI.Comm, inertia: Inertia, *, name: str, velocity: Values,
+        angular_velocity: Values, force: VectorInTime, torque: VectorInTime,
+        motion: VectorInTime | None, rotation: Any,
+    ) -> None:  # fmt: skip
         """Set up what both constructors share."""
         self.name, self._inertia = name, inertia
         self.comm = petsc_compat.petsc_communicator(comm)
@@ -322,13 +314,7 @@ class RigidBody(MeshBody):
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
-        u = np.zeros((4, 3))
-        if self._drive.moves:
-            u[0] = self._drive.displacement(time)
-        if self._drive.turns:
-            turn = self._drive.rotation(time) - np.eye(3)
-            u[1:] = self.length * (turn @ self._inertia.axes).T
-        return u.ravel()[self.fixed]
+        return self._drive.coordinates(time, self._inertia)[self.fixed]
 
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
@@ -364,8 +350,7 @@ class RigidBody(MeshBody):
             return self._matrix.at(mass, None)
         turning = np.zeros((9, 9))
         if self.num_owned:
-            by_directors = self._loads.gradient(self._directors(u1))
-            turning = stiffness * self._theta * by_directors
+            turning += stiffness * self._theta * self._loads.gradient(self._directors(u1))
         return self._matrix.at(mass, turning)
 
     def nodal_stiffness(self) -> FloatArray:
@@ -383,13 +368,12 @@ class RigidBody(MeshBody):
             UserFunctionError: It has.
         """
         if self._densities:
-            same, problem = np.array_equal(self.parameters(), self._measured), None
-            if not same:
-                problem = (
-                    f"density of {self.name!r}: has changed, but the mass of a rigid body is "
-                    "measured when it is made; make a new body"
-                )
-            raise_together(self.comm, problem, UserFunctionError)
+            same = np.array_equal(self.parameters(), self._measured)
+            problem = (
+                f"density of {self.name!r}: has changed, but the mass of a rigid body is measured "
+                "when it is made; make a new body"
+            )
+            raise_together(self.comm, None if same else problem, UserFunctionError)
 
     def potential(self, u: FloatArray) -> float:
         """None [J]: loads do external work."""
@@ -402,16 +386,15 @@ class RigidBody(MeshBody):
         """
         rows = np.zeros((2, 3))
         if self.num_owned and self._fixed.any():
-            forces = residual.reshape(4, 3)
-            rows[0] = forces[0]
-            rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)
+            force, *on_directors = residual.reshape(4, 3)
+            rows[:] = force, cross(self._directors(u1), np.array(on_directors)).sum(axis=0)
         return rows[[self._drive.moves, self._drive.turns]]
 
     @property
     def reaction_labels(self) -> list[tuple[str, str]]:
         """Name and unit of each row of `reactions`."""
-        force = [("force", "N")] if self._drive.moves else []
-        return force + ([("moment", "N m")] if self._drive.turns else [])
+        both = ("force", "N"), ("moment", "N m")
+        return list(compress(both, (self._drive.moves, self._drive.turns)))
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,13 +10,13 @@ from mpi4py import MPI
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinx_nts.bodies.rigid.inertia import misfit_of_axes
+from dolfinx_nts.bodies.conditions import VectorInTime
+from dolfinx_nts.bodies.loads import load_at
+from dolfinx_nts.bodies.rigid.inertia import Inertia, misfit_of_axes
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import FloatArray, OfTime
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import UserFunctionError, agree, call_together, floats, vector_in_time
-
-VectorInTime = Sequence[float] | FloatArray | OfTime
 
 #: Part of a torque along an axis without inertia that counts as none.
 _ALONG = 1e-6
@@ -40,13 +39,9 @@ class RigidLoads:
     """
 
     def __init__(
-        self,
-        comm: MPI.Comm,
-        name: str,
-        force: VectorInTime,
-        torque: VectorInTime,
+        self, comm: MPI.Comm, name: str, force: VectorInTime, torque: VectorInTime,
         euler: FloatArray,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._comm, self._name, self._turned = comm, name, euler > 0.0
         self._given = ("force", force, "N"), ("torque", torque, "N m")
         self.in_time = callable(force) or callable(torque)
@@ -73,8 +68,7 @@ class RigidLoads:
             UserFunctionError: The torque is about an axis without inertia.
         """
         self.force, self.torque = (
-            (1.0 if callable(value) else ramp)
-            * vector_in_time(self._comm, f"{what} of {self._name!r}", value, time, unit)
+            load_at(self._comm, f"{what} of {self._name!r}", value, unit, time, ramp)
             for what, value, unit in self._given
         )
         self._check_torque(axes)
@@ -194,6 +188,16 @@ class PrescribedMotion:
         else:
             raise_together(self._comm, f"{name}={given!r}: {problem}" if problem else None)
         return turned
+
+    def coordinates(self, time: float, inertia: Inertia) -> FloatArray:
+        """Displacements of the four nodes, 0 where they are free [m], shape (12,). Collective."""
+        u = np.zeros((4, 3))
+        if self.moves:
+            u[0] = self.displacement(time)
+        if self.turns:
+            turn = self.rotation(time) - np.eye(3)
+            u[1:] = inertia.length * (turn @ inertia.axes).T
+        return u.ravel()
 
     def turn(self, start: float, end: float) -> float:
         """Turn between two times [rad], at least. Collective.

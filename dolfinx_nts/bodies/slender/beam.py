@@ -11,8 +11,9 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.slender.axis import axis_of, check_line
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
+from dolfinx_nts.bodies.slender.director_loads import Load
 from dolfinx_nts.bodies.slender.director_mesh import WholeSkin, of_beam
-from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
+from dolfinx_nts.bodies.slender.node_conditions import Clamp
 from dolfinx_nts.bodies.slender.section import Section
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.points import Points

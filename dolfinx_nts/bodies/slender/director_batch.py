@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -12,6 +11,7 @@ from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.slender.director_elements import DirectorElements
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
+from dolfinx_nts.bodies.slender.element_forces import ElementForces
 from dolfinx_nts.bodies.slender.element_values import ElementValues
 from dolfinx_nts.bodies.slender.node_moments import NodeMoments
 from dolfinx_nts.integrators import Integrator
@@ -19,7 +19,7 @@ from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.types import FloatArray, IntArray
 
 
-class DirectorBatch(BodyBatch):
+class DirectorBatch(ElementForces, BodyBatch):
     """Beams or shells with directors and masses in common, see `DirectorBody.alike`.
 
     Args:
@@ -40,41 +40,17 @@ class DirectorBatch(BodyBatch):
             for name in ("cells", "ghosts")
         )  # fmt: skip
         self._values = ElementValues(self.comm, self.num_owned // width, ghosts, cells, width)
-        self._elements = DirectorElements.together(each, self._values)
+        self.elements = DirectorElements.together(each, self._values)
         self._moments = NodeMoments(np.empty(0, dtype=np.int64), width, self.length)
         self._none = np.zeros((0, directors, 3, 3))
-        self._matrix: Any = None
 
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
-        self._elements.begin(moment.u0, rule.taken_at)
-
-    def inertia(self, v: FloatArray) -> FloatArray:
-        """M v [kg m/s for a velocity]. Collective."""
-        return self._elements.inertia(v)
-
-    def internal(self, u1: FloatArray) -> FloatArray:
-        """Internal forces of the step [N]. Collective."""
-        return self._elements.internal(u1)
+        self.elements.begin(moment.u0, rule.taken_at)
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M + stiffness K, the same matrix in each call. Collective."""
         if self._matrix is None:
             self._matrix = DirectorMatrix(self._values, self._moments, self.fixed)
-        values = self._elements.tangent(u1, mass, stiffness)
+        values = self.elements.tangent(u1, mass, stiffness)
         return self._matrix.assemble(values, self._none, 1.0)
-
-    def nodal_stiffness(self) -> FloatArray:
-        """Mean diagonal of the tangent at each node in the reference [N/m]. Collective."""
-        return self._elements.nodal_stiffness()
-
-    def potential(self, u: FloatArray) -> float:
-        """Strain energy on this rank [J]. Collective."""
-        return self._elements.potential(u)
-
-    def destroy(self) -> None:
-        """Free the PETSc objects; the members' are theirs."""
-        super().destroy()
-        for a in (self._values, self._matrix):
-            if a is not None:
-                a.destroy()

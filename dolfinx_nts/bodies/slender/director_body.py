@@ -13,20 +13,20 @@ from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure
+from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
+from dolfinx_nts.bodies.loads import Pressure
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_values import cell_function, motion_on
 from dolfinx_nts.bodies.slender import turns
 from dolfinx_nts.bodies.slender.director_elements import DirectorElements
+from dolfinx_nts.bodies.slender.director_loads import DirectorLoads, Load
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, WholeSkin
 from dolfinx_nts.bodies.slender.director_skin import DirectorSkin
+from dolfinx_nts.bodies.slender.element_forces import ElementForces
 from dolfinx_nts.bodies.slender.element_values import ElementValues
-from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load, NodeConditions
-from dolfinx_nts.bodies.slender.node_moments import NodeMoments
-from dolfinx_nts.bodies.slender.pressure import Pressures
+from dolfinx_nts.bodies.slender.node_conditions import Clamp, NodeConditions
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
@@ -40,15 +40,11 @@ from dolfinx_nts.validation import at_points, vector, vectors
 _AT_NODE = 1e-9
 
 
-class DirectorBody(Body):
+class DirectorBody(ElementForces):
     """A body whose nodes have a place phi and directors D_i = l d_i, held by constraints.
 
-    A subclass says what its nodes, elements and masses are; see `_set_up`.
-
-    Attributes:
-        u: Displacement of the places [m], dolfinx Function of the last accepted state.
-        v: Velocity of the places [m/s], dolfinx Function.
-        space: Their function space.
+    A subclass says what its nodes, elements and masses are; see `_set_up`. The Functions `u` and
+    `v` are of the places.
     """
 
     oriented = True
@@ -91,15 +87,10 @@ class DirectorBody(Body):
         self.u, self.v = motion_on(self.space, name)
 
     def _set_up(
-        self,
-        director_mesh: DirectorMesh,
-        length: float,
-        masses: FloatArray,
-        bcs: Sequence[Clamp | Dirichlet],
-        forces: Sequence[Load | Pressure],
-        velocity: Values,
+        self, director_mesh: DirectorMesh, length: float, masses: FloatArray,
+        bcs: Sequence[Clamp | Dirichlet], forces: Sequence[Load | Pressure], velocity: Values,
         spin: FloatArray,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Set up all but the mesh.
 
         Args:
@@ -114,26 +105,23 @@ class DirectorBody(Body):
         self._director_mesh, self.length, self._masses = director_mesh, length, masses
         self._width = 3 * len(masses)
         self._set_up_nodes()
-        self._set_up_elements()
         self._conditions = NodeConditions(
-            self.comm, director_mesh, self._here, bcs, forces, self.kind, self.name
+            self.comm, director_mesh, self._here, bcs, self.kind, self.name
         )
         self.fixed, self.driven = self._conditions.fixed, self._conditions.driven
-        self.loads_in_time = self._conditions.loads_in_time
-        self._moments = NodeMoments(self._conditions.turned, self._width, length)
-        self._pressures = Pressures(
-            self.comm, director_mesh, self._cells, self._conditions.pressures, self.name
+        self._loads = DirectorLoads(
+            self.comm, director_mesh, self.elements, length, forces, self.kind, self.name
         )
+        self.loads_in_time = any(map(callable, self._loads.settings))
         self._set_up_velocity(velocity, spin)
         held = self._here.start + self._conditions.free_directors
         along = np.empty_like(director_mesh.order)
         along[director_mesh.order] = np.arange(len(along))
         self.joints = (Directors(self, self.points_of(held, self._place), length, along[held]),)
-        self._matrix: Any = None
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
 
     def _set_up_nodes(self) -> None:
-        """Reference of this rank's nodes, and what exchanges values with other ranks."""
+        """This rank's nodes and elements, and what exchanges values with other ranks."""
         topology, index_map = self.mesh.topology, self.space.dofmap.index_map
         owned = topology.index_map(topology.dim).size_local
         start = self.comm.exscan(owned) or 0
@@ -148,18 +136,16 @@ class DirectorBody(Body):
         self._place = np.eye(self._width // 3)[:1]
         self.places = np.tile(self._place[0] > 0.0, len(here))
 
+        y = self._vectors_at(self._cells.ravel())
+        y = y.reshape(len(self._cells), self._values.num_vectors, 3)
+        strained, shares = self._elements_of(y)
+        self.elements = DirectorElements(self._values, strained, y, shares, self._masses)
+        self.nodal_mass: FloatArray = self.elements.nodal_mass
+
     def _vectors_at(self, nodes: IntArray) -> FloatArray:
         """Nodal vectors of nodes in the reference [m], shape (n, vectors, 3)."""
         x, directors = self._director_mesh.x[nodes], self._director_mesh.directors[nodes]
         return np.concatenate([x[:, None], self.length * directors], axis=1)
-
-    def _set_up_elements(self) -> None:
-        """This rank's elements, and their mass."""
-        n, _ = self._cells.shape
-        y = self._vectors_at(self._cells.ravel()).reshape(n, self._values.num_vectors, 3)
-        strained, shares = self._elements_of(y)
-        self.elements = DirectorElements(self._values, strained, y, shares, self._masses)
-        self.nodal_mass: FloatArray = self.elements.nodal_mass
 
     def _set_up_velocity(self, velocity: Values, spin: FloatArray) -> None:
         x, d = self._director_mesh.x[self._here], self._director_mesh.directors[self._here]
@@ -207,11 +193,7 @@ class DirectorBody(Body):
         }
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Stress resultants in this rank's cells.
-
-        Args:
-            y: Nodal vectors of the cells [m], shape (n, vectors, 3).
-        """
+        """Stress resultants in this rank's cells, of nodal vectors [m], shape (n, vectors, 3)."""
         raise NotImplementedError
 
     # ---- points
@@ -281,75 +263,44 @@ class DirectorBody(Body):
         self.check_alive()
         self.elements.begin(moment.u0, rule.taken_at)
         self._u0, self._held_at = moment.u0, rule.theta
-        self._load, moments = self._conditions.loads(moment.time, moment.ramp)
-        self._moments.begin(moments)
-        self._pressures.begin(moment.time, moment.ramp)
+        self._loads.begin(moment.time, moment.ramp)
 
     @property
     def alike(self) -> Hashable | None:
         """What those have in common that a step evaluates together; None: it does so alone."""
-        if not self._conditions.none:
+        if self._conditions.values or self._loads.settings:
             return None
         return self._cells.shape[1], self.length, *self._masses.tolist()
 
     @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
-        return self._conditions.settings
+        return {"bcs": self._conditions.values, "forces": self._loads.settings}
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
         return self._conditions.prescribed(time)
 
-    def inertia(self, v: FloatArray) -> FloatArray:
-        """M v [kg m/s for a velocity]. Collective."""
-        return self.elements.inertia(v)
-
-    def internal(self, u1: FloatArray) -> FloatArray:
-        """Internal forces of the step [N]. Collective."""
-        return self.elements.internal(u1)
-
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Loads and gravity [N]; a moment acts on directors where the step takes its forces."""
         f = self.weight(gravity).reshape(-1, self._width)
-        f[:, :3] += self._load
-        moments = self._moments
-        if moments.turned.size:
-            y = self.reference + self._u0 + self._held_at * (u1 - self._u0)
-            f[moments.turned, 3:] += moments.push(y)
-        if self._pressures:
-            on_cells = np.zeros((len(self._cells), self._values.num_vectors, 3))
-            x0, x1 = self.elements.y0[:, ::2], self._vectors(u1)[:, ::2]
-            on_cells[:, ::2] = self._pressures.forces(x0, x1, self.elements.theta)
-            f += self._values.sums(on_cells).reshape(f.shape)
+        y = self.reference + self._u0 + self._held_at * (u1 - self._u0)
+        self._loads.add_to(f, y, u1)
         return f.ravel()
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M + stiffness K, the same matrix in each call. Collective."""
         if self._matrix is None:
-            self._matrix = DirectorMatrix(self._values, self._moments, self.fixed)
+            self._matrix = DirectorMatrix(self._values, self._loads.moments, self.fixed)
         self.check_alive()
-        elements = self.elements
-        values = elements.tangent(u1, mass, stiffness)
-        if stiffness and self._pressures:
-            (n, k, _), y1 = elements.rest.shape, elements.vectors(u1)
-            pushed = self._pressures.tangent(elements.y0[:, ::2], y1[:, ::2], elements.theta)
-            values.reshape(n, k, 3, k, 3)[:, ::2, :, ::2] -= stiffness * pushed
-        slopes = stiffness * self._held_at * self._moments.slopes()
-        directors = self._width // 3 - 1
-        of_moments = np.repeat(slopes, directors, axis=1)
-        scale = mass * self.nodal_mass if mass else stiffness * elements.diagonal
+        values = self.elements.tangent(u1, mass, stiffness)
+        self._loads.subtract_slopes(values, u1, stiffness)
+        slopes = stiffness * self._held_at * self._loads.moments.slopes()
+        of_moments = np.repeat(slopes, self._width // 3 - 1, axis=1)
+        scale = mass * self.nodal_mass if mass else stiffness * self.elements.diagonal
         places = np.repeat(self.places, 3)
         total = self.comm.allreduce(np.array([scale[places].sum(), places.sum()]))
         return self._matrix.assemble(values, of_moments, total[0] / total[1] or 1.0)
-
-    def nodal_stiffness(self) -> FloatArray:
-        """Mean diagonal of the tangent at each node in the reference [N/m]. Collective."""
-        return self.elements.nodal_stiffness()
-
-    def potential(self, u: FloatArray) -> float:
-        """Strain energy on this rank [J]. Collective."""
-        return self.elements.potential(u)
 
     def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""
@@ -362,26 +313,19 @@ class DirectorBody(Body):
         An element bends with the sine of that angle: from 90 degrees on a larger one needs a
         smaller moment, and nothing in it can tell. Collective.
         """
-        y, pairs = self._vectors(u), self._neighbours
+        y = self._vectors(u)
         if not len(y):
             return np.inf, np.full(3, np.nan)
         count = self._width // 3
-        directors = y.reshape(len(y), self._cells.shape[1], count, 3)[:, :, 1:]
-        least, cell, pair = turns.least_cosine(directors, pairs)
-        return least, self.elements.rest[cell, ::count][pairs[pair]].mean(axis=0)
+        nodes = (len(y), self._cells.shape[1], count, 3)
+        least, cell, pair = turns.least_cosine(y.reshape(nodes)[:, :, 1:], self._neighbours)
+        return least, self.elements.rest.reshape(nodes)[cell, pair, 0].mean(axis=0)
 
     def describe_det(self, det: float, place: FloatArray) -> tuple[str, str]:
         """How far neighbouring nodes turn against each other, and what elements are needed."""
-        turn = float(np.arccos(np.clip(det, -1.0, 1.0)))
-        bent = min(turn, 0.5 * np.pi)
-        straight, arc = (100.0 * (1.0 - part) for part in turns.moments(self._felt, bent))
-        x = ", ".join(f"{c:.4g}" for c in place)
-        text = (
-            f"{self.kind} {self.name!r} turns by {np.degrees(turn):.3g} degrees between "
-            f"neighbouring nodes near X = ({x}): too easy to bend by {straight:.0f} % if it was "
-            f"straight, by {arc:.0f} % if it was an arc like this"
-        )
-        return text, self._finer(bent / turns.that_leaves(self._felt, turns.RESOLVED))
+        what = f"{self.kind} {self.name!r}"
+        text, times = turns.described(self._felt, what, det, place)
+        return text, self._finer(times)
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
@@ -395,10 +339,3 @@ class DirectorBody(Body):
             here = self.at_mesh(values)
             function.x.array[: len(here)] = here
             function.x.scatter_forward()
-
-    def destroy(self) -> None:
-        """Free the PETSc objects; the body is of no use then."""
-        super().destroy()
-        for a in (self._values, self._matrix):
-            if a is not None:
-                a.destroy()

@@ -6,11 +6,11 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.bodies.conditions import Pressure
+from dolfinx_nts.bodies.loads import Pressure, pressure_at
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.kernels import pressure as kernel
 from dolfinx_nts.types import Array, FloatArray
-from dolfinx_nts.validation import at_points, number_at
+from dolfinx_nts.validation import at_points
 
 
 class Pressures:
@@ -67,9 +67,7 @@ class Pressures:
         """
         dead, following = np.zeros((2, len(self._unit)))
         for load, on_cells, what in self._loads:
-            value = ramp * load.value if not callable(load.value) else number_at(
-                self._comm, what, load.value, time, "Pa"
-            )  # fmt: skip
+            value = pressure_at(self._comm, what, load.value, time, ramp)
             (following if load.follower else dead)[:] += value * on_cells
         self._following = following[:, None, None]
         self._dead = dead[:, None, None] * self._unit

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from dolfinx.mesh import Mesh
 
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure
+from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.loads import Pressure
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
+from dolfinx_nts.bodies.slender.director_loads import Load
 from dolfinx_nts.bodies.slender.director_mesh import SIDES, WholeSkin, of_shell
 from dolfinx_nts.bodies.slender.midsurface import check_midsurface, midsurface_of
-from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
+from dolfinx_nts.bodies.slender.node_conditions import Clamp
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import shell as kernel

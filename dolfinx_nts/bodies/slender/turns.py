@@ -31,7 +31,21 @@ def that_leaves(felt: Felt, part: float) -> float:
     return float(brentq(lambda turn: moments(felt, turn)[0] - part, 1e-3, 0.5 * np.pi))
 
 
-def least_cosine(directors: FloatArray, pairs: IntArray) -> tuple[float, int, int]:
+def described(felt: Felt, what: str, cosine: float, place: FloatArray) -> tuple[str, float]:
+    """What `least_cosine` at a place means, and how many times as many elements are needed."""
+    turn = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    bent = min(turn, 0.5 * np.pi)
+    straight, arc = (100.0 * (1.0 - part) for part in moments(felt, bent))
+    x = ", ".join(f"{c:.4g}" for c in place)
+    text = (
+        f"{what} turns by {np.degrees(turn):.3g} degrees between neighbouring nodes near X = "
+        f"({x}): too easy to bend by {straight:.0f} % if it was straight, by {arc:.0f} % if it was "
+        "an arc like this"
+    )
+    return text, bent / that_leaves(felt, RESOLVED)
+
+
+def least_cosine(directors: FloatArray, pairs: IntArray) -> tuple[float, int, IntArray]:
     """Smallest cosine of the turn between neighbouring nodes, its element and its pair.
 
     Args:
@@ -39,7 +53,7 @@ def least_cosine(directors: FloatArray, pairs: IntArray) -> tuple[float, int, in
         pairs: Nodes that are neighbours, shape (p, 2).
 
     Returns:
-        The cosine, -inf where it is no number, the element and the pair.
+        The cosine, -inf where it is no number, the element and both nodes.
     """
     count = directors.shape[2]
     flat = directors.reshape(*directors.shape[:2], 3 * count)
@@ -52,4 +66,5 @@ def least_cosine(directors: FloatArray, pairs: IntArray) -> tuple[float, int, in
     if count > 1:
         # Products of three directors are 1 + 2 cos of their turn, in terms of one.
         least = 1.5 * least - 0.5
-    return (least if np.isfinite(least) else -np.inf, *divmod(i, len(pairs)))
+    element, pair = divmod(i, len(pairs))
+    return least if np.isfinite(least) else -np.inf, element, pairs[pair]

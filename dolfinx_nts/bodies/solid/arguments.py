@@ -9,6 +9,7 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.solid.viscosity import check_viscosity
+from dolfinx_nts.contact.linear_facets import HIGHEST
 from dolfinx_nts.validation import require_bool, require_one_of
 
 
@@ -55,4 +56,30 @@ def check_cells(
         raise ValueError(
             f"bending={bending!r} of {name!r}: is for bodies without viscosity, which would damp "
             "cells that bend by the shear of their corners; use degree=2"
+        )
+
+
+def check_surface(mesh: Mesh, degree: int, name: str, mass: str) -> None:
+    """Raise a ValueError where a solid has no surface of such a mass.
+
+    Args:
+        mesh: Its mesh.
+        degree: Of the body.
+        name: Of the body.
+        mass: As of `MeshBody.surface`.
+    """
+    if mesh.topology.dim != 3:
+        raise ValueError(
+            f"body {name!r}: contact surfaces are boundaries of 3D meshes, not of "
+            f"{compat.cell_name(mesh)}s"
+        )
+    if degree > HIGHEST:
+        raise ValueError(
+            f"degree={degree} of body {name!r}: surfaces, of contacts and of ties, need degree 1 "
+            f"or {HIGHEST}; pass degree={HIGHEST}"
+        )
+    if mass == "redistributed" and degree > 1:
+        raise ValueError(
+            f"mass={mass!r} of a surface of {name!r}: needs degree 1, as at nodes of degree "
+            f"{degree} the mass of some is negative; use mass='consistent', or degree=1"
         )

@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.conditions import Dirichlet, Pressure, Traction, VectorInTime, facets_of
+from dolfinx_nts.bodies.conditions import Dirichlet, VectorInTime
+from dolfinx_nts.bodies.loads import Pressure, SolidLoads, Traction
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
+from dolfinx_nts.bodies.nodal_values import largest_side
 from dolfinx_nts.bodies.solid.arguments import check_cells, check_material
 from dolfinx_nts.bodies.solid.bending_modes import BendingModes, StepModes
 from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans, NodesOfCells
-from dolfinx_nts.bodies.solid.materials import bulk_over_shear, misfit, with_constants
+from dolfinx_nts.bodies.solid.locking import Locking
+from dolfinx_nts.bodies.solid.materials import misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter
 from dolfinx_nts.bodies.solid.stress_jumps import StressJumps
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
@@ -29,28 +31,18 @@ from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, global_sum, raise_together
+from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
-    items,
     known_options,
-    number_at,
     require_name,
-    vector_in_time,
 )
 
 #: Stress of an undeformed body, over its stiffness, that counts as none.
 _STRESS_FREE = 1e-6
 #: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
 _SMALL_STRAIN = 1e-4
-#: Bulk over shear modulus from which on cells of degree 1 lock in any motion (nu = 0.499).
-_INCOMPRESSIBLE = 500.0
-#: Strain that is rounding.
-_ROUNDED_STRAIN = 1e-12
-#: Largest spread of a body's nodes over the least from which on it may bend: a bar or plate of one
-#: cell over the thickness is some 4 times as long as thick.
-_THIN = 2.3
 
 
 @known_options
@@ -141,32 +133,27 @@ class Continuum(UflBody):
             if value is not None and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
-        traction = items(
-            "traction", traction, lambda t: isinstance(t, Traction | Pressure),
-            "Traction or Pressure",
-        )  # fmt: skip
-        follows = any(isinstance(load, Pressure) and load.follower for load in traction)
         least = check_mesh(mesh, name)
         degree = degree or (2 if compat.cell_name(mesh) == "tetrahedron" else least)
         viscous = is_viscous(viscosity)
         check_cells(mesh, degree, least, name, volume, bending, viscous)
         quadrature_degree = quadrature_degree or 2 * degree
+        space = compat.vector_space(mesh, degree)
+        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
+        self._loads = loads = SolidLoads(space, name, body_force, traction, self._dx)
         super().__init__(
-            compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
-            allow_inversion, self._viscous if viscous else None,
-            self._following if follows else None,
+            space, degree, name, extra_form, quadrature_degree, allow_inversion,
+            self._viscous if viscous else None, loads.following if loads.follows else None,
         )  # fmt: skip
         self.material, self.density, self.viscosity = material, density, viscosity
         self.losses = ("viscous_dissipation",) if viscous else ()
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
-        self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
-        self.body_force, self._traction = body_force, traction
+        side = largest_side(self.comm, self.reference)
+        self.rounded = 0.0 if isinstance(material, Isotropic) else side
+        self.body_force = body_force
+        self.loads_in_time = loads.in_time or extra_form is not None or loads.follows
         # A curved cell's volume is a polynomial, too.
         self._of_mass = max(quadrature_degree, 2 * degree + 3 * (least - 1))
-        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
-        self._ds = self._boundary_measure(quadrature_degree)
-        changing = any(callable(value) for value, _ in self._loads_at(0.0))
-        self.loads_in_time = changing or extra_form is not None or follows
         self._stand(bcs, velocity, displacement)
         self._rho, self._eta = self._density(density), self._on_mesh("viscosity", viscosity)
         self.law = strain_energy(with_constants(material, self.mesh))
@@ -177,68 +164,16 @@ class Continuum(UflBody):
         self._bent = None if self._modes is None else fem.Function(self._modes.space)
         self._check_energy()
         law, means = self.energy()
-        energy, load = law(green_strain(self.gradient)), self._load_in_ufl()
-        (self._load_form,) = self._set_forms(
-            energy * self._dx, load, means=means, others=[self._eta]
-        )
-        self._assembled_loads = np.zeros(sum(constant.value.size for constant in self._loads))
+        energy = law(green_strain(self.gradient)) * self._dx
+        (self._load_form,) = self._set_forms(energy, loads.work, means=means, others=[self._eta])
         self._seen_at_rest = False
-        self._jumps: tuple[StressJumps, CellMeans | None] | None = None
         self.stressed = None
+        self.locking = Locking(
+            self.space, self.reference, degree, material, volume=volume, bending=bending,
+            jumps=self._stress_jumps,
+        )  # fmt: skip
 
     # ---- set-up
-    def _boundary_measure(self, degree: int) -> Any:
-        indices = []
-        for k, load in enumerate(self._traction):
-            what = f"{type(load).__name__}.where of traction[{k}] of {self.name!r}"
-            everywhere = load.where is None and isinstance(load, Pressure)
-            indices.append(
-                compat.exterior_facets(self.mesh) if everywhere
-                else facets_of(self.mesh, load.where, what)
-            )  # fmt: skip
-        tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
-        empty = np.empty(0, np.int32)
-        index, tag = (
-            np.concatenate([empty, *indices]).astype(np.int32),
-            np.concatenate([empty, *tags]),
-        )
-        shared = len(index) - len(np.unique(index))
-        text = (
-            f"traction of {self.name!r}: {shared} facets carry two loads; add their values up in "
-            "one of them"
-        )
-        raise_together(self.comm, text if shared else None)
-        order = np.argsort(index)
-        data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
-        return ufl.Measure(
-            "ds", self.mesh, subdomain_data=data, metadata={"quadrature_degree": degree}
-        )
-
-    def _load_in_ufl(self) -> Any:
-        """Virtual work of all loads but those that follow; their values are Constants."""
-        w, n = ufl.TestFunction(self.space), ufl.FacetNormal(self.mesh)
-        self._loads = [
-            fem.Constant(self.mesh, np.zeros(() if isinstance(load, Pressure) else 3))
-            for load in (None, *self._traction)
-        ]
-        load = ufl.inner(self._loads[0], w) * self._dx
-        for k, (given, value) in enumerate(zip(self._traction, self._loads[1:], strict=True)):
-            if not isinstance(given, Pressure):
-                load += ufl.inner(value, w) * self._ds(k)
-            elif not given.follower:
-                load -= value * ufl.inner(n, w) * self._ds(k)
-        return load
-
-    def _following(self, u: Any, v: Any, w: Any, t: Any) -> Any:
-        """Virtual work of the pressures that follow, as of `extra_form`."""
-        f = ufl.Identity(3) + ufl.grad(u)
-        area = ufl.dot(ufl.det(f) * ufl.inv(f).T, ufl.FacetNormal(self.mesh))
-        return sum(
-            value * ufl.inner(area, w) * self._ds(k)
-            for k, (load, value) in enumerate(zip(self._traction, self._loads[1:], strict=True))
-            if isinstance(load, Pressure) and load.follower
-        )
-
     def energy(self) -> tuple[Any, CellMeans | None]:
         """W as a function of Green's strain in UFL that forces are made of, and means it makes."""
         if self._volume == "full":
@@ -299,6 +234,16 @@ class Continuum(UflBody):
         """Virtual work of the viscosity in UFL."""
         return viscous_work(self._eta, u, v, w) * self._dx
 
+    def _stress_jumps(self) -> StressJumps:
+        """Of the stress at the state of `u`."""
+        law, means = self.energy()
+        stress = law.at_point(green_strain(self.gradient))
+        if means is not None:
+            means.compile(self.u)
+        return StressJumps(
+            stress, self.mesh, self._dx, means, lambda: self.potential(self.last_accepted()[0])
+        )
+
     # ---- as of Body
     def lost(self, u1: FloatArray) -> dict[str, float]:
         """As of `Body`."""
@@ -307,77 +252,11 @@ class Continuum(UflBody):
     @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
-        loads = {"body_force": self.body_force, "traction": self._load_settings}
+        loads = {"body_force": self.body_force, "traction": self._loads.settings}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
         own["viscosity"] = self.viscosity
         own |= {"volume": self._volume, "bending": self._modes is not None}
         return own | loads | super().settings
-
-    @property
-    def _load_settings(self) -> list[Any]:
-        """Of each traction its value, and of a pressure whether it follows."""
-        return [
-            (load.value, load.follower) if isinstance(load, Pressure) else load.value
-            for load in self._traction
-        ]
-
-    def stress_jumps(self) -> FloatArray:
-        """As of `Body`."""
-        if self._jumps is None:
-            law, means = self.energy()
-            stress = law.at_point(green_strain(self.gradient))
-            if means is not None:
-                means.compile(self.u)
-            self._jumps = StressJumps(stress, self.mesh, self._dx), means
-        jumps, means = self._jumps
-        if means is not None:
-            means.evaluate()
-        found = jumps.sums()
-        here = self.potential(self.u.x.array[: self.num_owned])
-        stored = abs(float(global_sum(self.comm, np.array([here]))[0]))
-        # Stress times strain is twice the energy. Where nothing is strained all stress is rounding.
-        strained = 2.0 * stored > _ROUNDED_STRAIN * math.sqrt(found[1] * jumps.volume)
-        return found if strained else np.zeros(2)
-
-    @property
-    def remedy_of_locking(self) -> str:
-        """As of `Body`."""
-        if self._linear and compat.cell_name(self.mesh) == "tetrahedron":
-            return "use degree=2, hexahedra, or a finer mesh"
-        if self._modes is not None:
-            return "use degree=2, or a finer mesh"
-        if self._linear and self._volume == "full":
-            thin = "bending=True in thin, stiff parts of regular cells"
-            return f"use volume='projected', {thin}, or a finer mesh"
-        return "use a finer mesh"
-
-    @property
-    def _linear(self) -> bool:
-        return self.degree == 1
-
-    @property
-    def keeps_volume(self) -> bool:
-        """As of `Body`."""
-        full = self._linear and self._volume == "full"
-        return full and bulk_over_shear(self.material) > _INCOMPRESSIBLE
-
-    @cached_property
-    def is_thin(self) -> bool:  # type: ignore[override]
-        """As of `Body`."""
-        if not self._linear or self._modes is not None:
-            return False
-        x = self.reference.reshape(-1, 3)
-        count = global_sum(self.comm, np.array([float(len(x))]))
-        off = x - global_sum(self.comm, x.sum(axis=0)) / count
-        # Spread along the axes of the nodes, which is the same whatever way the body is turned.
-        moments: FloatArray = np.dot(off.T, off)
-        spread = np.linalg.eigvalsh(global_sum(self.comm, moments))
-        if spread[2] < _THIN**2 * spread[0]:
-            return False
-        outside = compat.exterior_facets(self.mesh)
-        on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
-        inside = len(x) - np.count_nonzero(np.unique(on_boundary) < len(x))
-        return not anywhere(self.comm, bool(inside))
 
     def inner(self, u1: FloatArray) -> FloatArray:
         """As of `Body`: the modes of the cells, shape (9 cells,)."""
@@ -417,19 +296,16 @@ class Continuum(UflBody):
     def destroy(self) -> None:
         """As of `Body`."""
         super().destroy()
-        if self._jumps is not None:
-            self._jumps[0].destroy()
+        if self.locking is not None:
+            self.locking.destroy()
 
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:
             self._seek_stress_at_rest(rule)
         super().begin_step(rule, moment)
-        for constant, (value, now) in zip(self._loads, self._loads_at(moment.time), strict=True):
-            constant.value[...] = now if callable(value) else moment.ramp * now
-        loads = np.concatenate([constant.value.ravel() for constant in self._loads])
-        if not np.array_equal(loads, self._assembled_loads):
-            self._load, self._assembled_loads = self._forms.assemble(self._load_form), loads
+        if self._loads.begin(moment.time, moment.ramp):
+            self._load = self._forms.assemble(self._load_form)
 
     def _seek_stress_at_rest(self, rule: Integrator) -> None:
         """Note whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
@@ -447,19 +323,3 @@ class Continuum(UflBody):
         stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()
         if not stress <= _STRESS_FREE * stiffness:
             self.stressed = stress / stiffness if stiffness else math.inf
-
-    def _loads_at(self, time: float) -> list[tuple[Any, Any]]:
-        """Body force, tractions and pressures as they were given, and their values at a time."""
-        what = f"body_force of {self.name!r}"
-        now: Any = vector_in_time(self.comm, what, self.body_force, time, "N/m^3")
-        found = [(self.body_force, now)]
-        for k, load in enumerate(self._traction):
-            what = f"{type(load).__name__}.value of traction[{k}] of {self.name!r}"
-            if not isinstance(load, Pressure):
-                now = vector_in_time(self.comm, what, load.value, time, "Pa")
-            elif callable(load.value):
-                now = number_at(self.comm, what, load.value, time, "Pa")
-            else:
-                now = load.value
-            found.append((load.value, now))
-        return found

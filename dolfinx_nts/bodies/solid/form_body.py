@@ -12,6 +12,7 @@ from dolfinx import fem
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
+from dolfinx_nts.bodies.nodal_values import largest_side
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.solid.step_forms import checked_form
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
@@ -124,7 +125,7 @@ class FormBody(UflBody):
         self._of_mass = max(self._quadrature, 2 * degree + 3 * (least - 1))
         super().__init__(space, degree, name, extra_form, self._quadrature, allow_inversion)
         self._rho = None if density is None else self._density(density)
-        self.rounded = self._size()
+        self.rounded = largest_side(self.comm, self.reference)
         self._potential = Potential(
             lambda *strains: self._integrated(energy(*strains), self._quadrature),
             _in_tuple(strain),

@@ -291,12 +291,9 @@ _STRAIN = 1e-4
 
 
 def waves(
-    potential: Callable[[FloatArray], float],
-    x: FloatArray,
-    mass: FloatArray,
-    massless: BoolArray,
+    potential: Callable[[FloatArray], float], x: FloatArray, mass: FloatArray, massless: BoolArray,
     comm: MPI.Comm,
-) -> tuple[float, float]:
+) -> tuple[float, float]:  # fmt: skip
     """Thickness of the layer over the body's, and speed of pressure waves over shear ones.
 
     From energies of uniform strains of the body, summed over the axes, and of translations of the

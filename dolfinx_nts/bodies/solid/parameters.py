@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx import fem
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import FloatArray
-from dolfinx_nts.validation import is_finite
+from dolfinx_nts.validation import UserFunctionError, is_finite
 
 #: What a parameter may be; the latter two of a scalar, a Function e.g. of degree 0.
 Parameter = float | fem.Constant | fem.Function
@@ -92,3 +94,50 @@ class Taken:
     def changed(self) -> bool:
         """Whether they are others now, on this rank."""
         return not np.array_equal(values_of(self._parameters), self._values)
+
+
+class WatchedParameters:
+    """Constants and Functions in a body's energy and mass, which a caller may change.
+
+    Args:
+        comm: MPI communicator.
+        name: Of the body, for messages.
+        of_mass: Those in the mass.
+        others: Those elsewhere.
+        check: Raises ValueError where one is out of its range. Collective.
+
+    Attributes:
+        all: They.
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, name: str, of_mass: list[Any], others: list[Any],
+        check: Callable[[], None],
+    ) -> None:  # fmt: skip
+        self._comm, self._name, self._check = comm, name, check
+        self.all = [*others, *of_mass]
+        self._taken = Taken(self.all), Taken(of_mass)
+
+    def take(self) -> None:
+        """Note the values of now, of which something was made."""
+        for taken in self._taken:
+            taken.take()
+
+    def changed(self) -> tuple[bool, bool]:
+        """Whether any, and any in the mass, has changed since on any rank. Collective.
+
+        Raises:
+            UserFunctionError: One is out of its range, on all ranks.
+        """
+        if not self.all:
+            return False, False
+        flags = np.array([taken.changed for taken in self._taken])
+        self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
+        problem, cause = None, None
+        try:
+            if flags[0]:
+                self._check()
+        except ValueError as error:
+            problem, cause = f"a parameter of {self._name!r} has changed: {error}", error
+        raise_together(self._comm, problem, UserFunctionError, cause)
+        return bool(flags[0]), bool(flags[1])

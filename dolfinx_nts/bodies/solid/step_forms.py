@@ -116,15 +116,10 @@ class StepForms:
     """
 
     def __init__(
-        self,
-        space: fem.FunctionSpace,
-        virtual_work: VirtualWork,
-        mass: MassForm,
-        extra: ExtraForm | None,
-        viscous: Callable[[Any, Any, Any], Any] | None,
-        check_alive: Callable[[], None],
-        following: ExtraForm | None = None,
-    ) -> None:
+        self, space: fem.FunctionSpace, virtual_work: VirtualWork, mass: MassForm,
+        extra: ExtraForm | None, viscous: Callable[[Any, Any, Any], Any] | None,
+        check_alive: Callable[[], None], following: ExtraForm | None = None,
+    ) -> None:  # fmt: skip
         self._check_alive, self._loads = check_alive, following
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
         self._viscous = viscous

@@ -6,39 +6,36 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
-from dolfinx_nts.bodies.nodal_values import motion_on, nodal_values
+from dolfinx_nts.bodies.nodal_values import motion_on, nodal_values, order_of_input
+from dolfinx_nts.bodies.solid.arguments import check_surface
 from dolfinx_nts.bodies.solid.cell_means import CellMeans
 from dolfinx_nts.bodies.solid.inversion import Determinants
 from dolfinx_nts.bodies.solid.mass import MassMatrix, waves
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
-    Taken,
+    WatchedParameters,
     in_expressions,
     is_number,
     require_positive_parameter,
     values_of,
 )
 from dolfinx_nts.bodies.solid.step_forms import StepForms, check_extra_form, fill
-from dolfinx_nts.contact.linear_facets import HIGHEST
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
-from dolfinx_nts.parallel import anywhere, gather_on_root, global_sum, raise_together
+from dolfinx_nts.parallel import anywhere, global_sum
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Places, Settings, Values
 from dolfinx_nts.validation import UserFunctionError, require_bool, require_name, vectors
 
@@ -58,11 +55,6 @@ class UflBody(MeshBody):
         viscous: Virtual work of a viscosity, as of `StepForms`.
         following: That of loads that follow the body, as `extra_form`.
 
-    Attributes:
-        u: Displacement [m], dolfinx Function of the last accepted state.
-        v: Velocity [m/s], dolfinx Function.
-        massless: Owned coordinates without mass, shape (num_owned,), see `surface`.
-        has_massless: Whether there are such on any rank.
     """
 
     _mass: MassMatrix
@@ -88,9 +80,8 @@ class UflBody(MeshBody):
         self._given_density: Parameter | None = None
         self.allow_inversion = allow_inversion
         # Cells of a surface or a line have no inside.
-        self._determinants: Determinants | None = None
-        if self.mesh.topology.dim == 3:
-            self._determinants = Determinants(space, degree, quadrature_degree)
+        solid = self.mesh.topology.dim == 3
+        self._determinants = Determinants(space, degree, quadrature_degree) if solid else None
         self._forms = StepForms(
             space, self._virtual_work, self._mass_form, extra_form, viscous, self.check_alive,
             following,
@@ -117,22 +108,7 @@ class UflBody(MeshBody):
 
     def _check_surface(self, mass: str) -> None:
         """As of `MeshBody`."""
-        if self.mesh.topology.dim != 3:
-            raise ValueError(
-                f"body {self.name!r}: contact surfaces are boundaries of 3D meshes, not of "
-                f"{compat.cell_name(self.mesh)}s"
-            )
-        degree = int(self.degree or 1)
-        if degree > HIGHEST:
-            raise ValueError(
-                f"degree={degree} of body {self.name!r}: surfaces, of contacts and of "
-                f"ties, need degree 1 or {HIGHEST}; pass degree={HIGHEST}"
-            )
-        if mass == "redistributed" and degree > 1:
-            raise ValueError(
-                f"mass={mass!r} of a surface of {self.name!r}: needs degree 1, as at nodes of "
-                f"degree {degree} the mass of some is negative; use mass='consistent', or degree=1"
-            )
+        check_surface(self.mesh, int(self.degree or 1), self.name, mass)
 
     def _make_massless(self, surface: Surface) -> None:
         """As of `MeshBody`."""
@@ -165,43 +141,27 @@ class UflBody(MeshBody):
         return in_mesh(self, vectors("x", x, "points [m]"), "x")
 
     def file_order(self) -> IntArray:
-        """Nodes in the order in which the cells of the input name them, on rank 0. Collective."""
-        owned = self.mesh.topology.index_map(self.mesh.topology.dim).size_local
-        cells = compat.cell_dofs(self.space)[:owned]
-        index_map = self.space.dofmap.index_map
-        nodes = index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(cells.shape)
-        original = np.asarray(self.mesh.topology.original_cell_index[:owned], dtype=np.int64)
-        order = np.argsort(gather_on_root(self.comm, original))
-        _, first = np.unique(gather_on_root(self.comm, nodes)[order], return_index=True)
-        return np.argsort(first)
+        """As of `Body`. Collective."""
+        return order_of_input(self.space)
 
     # ---- set-up
-    def _size(self) -> float:
-        """Largest side of the box around the body [m], the same on all ranks. Collective."""
-        x = self.reference.reshape(-1, 3)
-        ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
-        self.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-        return float(ends.sum(axis=0).max())
-
     def _stand(self, bcs: Sequence[Dirichlet], velocity: Values, displacement: Values) -> None:
         """Set conditions, and displacement and velocity at the start."""
         self._supports = Supports(self.comm, self.space, bcs, self.name)
         self.fixed, self.driven = self._supports.fixed, self._supports.driven
-        self.v.x.array[:] = self._given("velocity", velocity, "m/s")
+        given = nodal_values(self.space, "velocity", self.name, velocity, "m/s")
+        self.v.x.array[:] = given.ravel()
         self.v.x.array[self._supports.still] = 0.0
         self.v.x.scatter_forward()
         self.initial_velocity = self.v.x.array[: self.num_owned].copy()
-        self.u.x.array[:] = self._given("displacement", displacement, "m")
+        given = nodal_values(self.space, "displacement", self.name, displacement, "m")
+        self.u.x.array[:] = given.ravel()
         self.starts_moved = anywhere(self.comm, bool(self.u.x.array.any()))
         self.u.x.array[self.fixed] = self.prescribed(0.0)
         self.u.x.scatter_forward()
         self.initial_displacement = self.u.x.array[: self.num_owned].copy()
         if self._determinants is not None and self.starts_moved and not self.allow_inversion:
             self._determinants.refuse_inverted(self.u.x.array, self.name)
-
-    def _given(self, name: str, given: Any, unit: str) -> FloatArray:
-        """Values of an argument at all nodes of this rank, shape (coordinates,)."""
-        return nodal_values(self.space, name, self.name, given, unit).ravel()
 
     def _set_forms(
         self, energy: Any, *loads: Any, means: CellMeans | None = None, others: Sequence[Any] = ()
@@ -224,8 +184,10 @@ class UflBody(MeshBody):
             in_expressions((part.integrand() for part in form.integrals()), own)
             for form in (energy, mass)
         )
-        self._parameters = [*of_energy, *of_mass, *in_expressions(others)]
-        self._taken = Taken(self._parameters), Taken(of_mass)
+        self._parameters = WatchedParameters(
+            self.comm, self.name, of_mass, [*of_energy, *in_expressions(others)],
+            self._check_parameters,
+        )  # fmt: skip
         if self._extra_form is not None:
             check_extra_form(self, self._extra_form, w)
         self._energy_form, mass_form, *compiled = compile_forms([energy, mass, *loads])
@@ -235,23 +197,14 @@ class UflBody(MeshBody):
         return compiled
 
     def _density(self, density: Any) -> Any:
-        """A density as the forms take it: bodies of any number share compiled forms.
-
-        It is checked again where it changes.
-
-        Raises:
-            ValueError: It is on another mesh.
-        """
+        """A density as the forms take it; it is checked again where it changes."""
         self._given_density = density
         return self._on_mesh("density", density)
 
     def _on_mesh(self, name: str, value: Any) -> Any:
-        """A parameter as the forms take it.
-
-        Raises:
-            ValueError: It is on another mesh.
-        """
+        """A parameter as the forms take it; ValueError if it is on another mesh."""
         if is_number(value):
+            # Bodies of any number share compiled forms.
             return fem.Constant(self.mesh, float(value))
         problem = misfit([value], self.mesh.ufl_domain())
         if problem:
@@ -323,10 +276,7 @@ class UflBody(MeshBody):
         return value
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
-        """Smallest det F at corners and quadrature points on this rank, and X of its cell [m].
-
-        Without cells, or on a mesh that is not 3D, it is inf.
-        """
+        """As of `Body`, at corners and quadrature points of cells in 3D."""
         if self._determinants is None:
             return np.inf, np.full(3, np.nan)
         return self._determinants.smallest(self._forms.with_ghosts(u))
@@ -334,12 +284,12 @@ class UflBody(MeshBody):
     @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
-        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        constants = [t.value for t in self._parameters.all if isinstance(t, fem.Constant)]
         return {"bcs": self._supports.settings, "constants in the material": constants}
 
     def parameters(self) -> FloatArray:
         """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""
-        return values_of(self._parameters)
+        return values_of(self._parameters.all)
 
     def take_parameters(self) -> None:
         """Assemble the mass anew if what it is made of has changed. Collective.
@@ -348,24 +298,20 @@ class UflBody(MeshBody):
             UserFunctionError: A value is out of range, there is no mass left, or it has been moved
                 between nodes.
         """
-        if not self._parameters:
-            return
-        changed = np.array([taken.changed for taken in self._taken])
-        self.comm.Allreduce(MPI.IN_PLACE, changed, op=MPI.LOR)
-        if not changed.any():
-            return
-        self._refuse_values()
-        self._taken[0].take()
-        self._stiffness = None
-        if not changed[1]:
-            return
+        changed, of_mass = self._parameters.changed()
+        if changed:
+            self._stiffness = None
+        if of_mass:
+            self._renew_mass()
+        self._parameters.take()
+
+    def _renew_mass(self) -> None:
         if self.has_massless:
             raise UserFunctionError(
                 f"density of {self.name!r}: has changed after mass='redistributed' of a surface "
                 "took it from its nodes; keep it, or use mass='consistent'"
             )
         self._mass.assemble()
-        self._taken[1].take()
         self.nodal_mass = self._mass.nodal
         total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
         if not total > 0.0:
@@ -373,15 +319,6 @@ class UflBody(MeshBody):
                 f"mass of {self.name!r}: its parameters now make {total:.3g}; it must be "
                 "positive"
             )
-
-    def _refuse_values(self) -> None:
-        """Raise a UserFunctionError on every rank if a changed parameter is out of its range."""
-        problem, cause = None, None
-        try:
-            self._check_parameters()
-        except ValueError as error:
-            problem, cause = f"a parameter of {self.name!r} has changed: {error}", error
-        raise_together(self.comm, problem, UserFunctionError, cause)
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""
