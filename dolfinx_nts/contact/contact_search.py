@@ -122,9 +122,10 @@ class ContactSearch:
         near = {k: self._edges[k] for k in self._sought if k in self._edges}
         for k in self.edges.keys() - near.keys():
             self._edges[k].leave()
-        self.edges = near
+        known, self.edges = self.edges, near
         for k, edges in near.items():
-            edges.begin(step, step.state.edges[k], again, search)
+            # What comes near within the step has no solution of it to go on from.
+            edges.begin(step, step.state.edges[k], again if k in known else None, search)
         if search:
             self._followed = {k: self._old[k].followed for k in self._sought}
             self._seek()

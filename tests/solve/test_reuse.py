@@ -395,7 +395,7 @@ def test_what_rests_or_is_not_there_is_evaluated_once_a_step(monkeypatch):
         stepper = nts.Stepper(system, nts.EnergyMomentum())
         counts = [
             counting(right, "internal"), counting(right, "smallest_det"),
-            counting(pair, "positions"), counting(stepper.problem._terms, "_evaluated"),
+            counting(pair, "placed"), counting(stepper.problem._terms, "_evaluated"),
         ]  # fmt: skip
         if not remember:
             monkeypatch.setattr(Unknowns, "moves", lambda self, *_: [1.0] * len(self.awake))
