@@ -227,12 +227,14 @@ def test_bricks_dropped_on_each_other_come_to_rest():
     both = [(left, floor), (right, floor), (upper, left), (upper, right)]
     contacts = [nts.ContactPair(*pair, friction=0.4) for pair in both]
     system = nts.System(bodies, contacts=contacts, gravity=(0, 0, -G))
-    run = nts.simulate(system, nts.GeneralizedAlpha(rho_inf=0.5), dt=2e-3, t_end=0.1)
+    run = nts.simulate(system, nts.GeneralizedAlpha(rho_inf=0.5), dt=2e-3, t_end=0.14)
     # The scheme is not one that keeps energy, as the status says.
     assert run.status.startswith("completed")
     table, weight = run.balance, 1e3 * wide * high * 0.1 * G
     assert table["kinetic"][-1] < 1e-6 * table["external_work"][-1]
     for body, z in zip(bodies, (0.5, 0.5, 1.5), strict=True):
         assert abs(body.position[2] - z * high) < 1e-9 * high
-    carried = run.contact_forces[-1, :, 2] / weight
+    # Gaps count as closed to 1e-10 of a facet: forces of single steps are known to m / dt^2 of
+    # that, a millionth of the weight, and their mean to what the velocity then still is.
+    carried = run.contact_forces[-20:, :, 2].mean(axis=0) / weight
     assert np.abs(carried - [1.5, 1.5, 0.5, 0.5]).max() < 1e-6
