@@ -21,8 +21,8 @@ from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.contact.placed import Placed
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
-from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -59,14 +59,13 @@ class ContactSearch:
         edges: Mapping[int, EdgeCoupling] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         self._pairs, self._of, self._comm = contacts, list(bodies), comm
-        self.numbers: list[int] = []
-        self.bodies: list[tuple[int, ...]] = []
+        self.numbers, self.bodies = list[int](), list[tuple[int, ...]]()
         self.elements, self.idle = list[ContactElements](), list[ContactElements]()
         self.idle_gaps: list[FloatArray] = []
         self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
-        number = {id(pair): k for k, pair in enumerate(contacts)}
-        self._corners = [(c, number[id(c.of)]) for c in contacts if isinstance(c, Corners)]
-        self._edges = edges
+        self._places, self._edges = Placed(contacts, bodies), edges
+        both = zip(contacts, self._places.own, strict=True)
+        self._corners = [(c, own) for c, own in both if isinstance(c, Corners)]
         self.edges: dict[int, EdgeCoupling] = {}
         self._apart = Apart(contacts, bodies)
         self._sought: list[int] = []
@@ -79,8 +78,8 @@ class ContactSearch:
         shares, before = [pair.slave.share for pair in contacts], held_before(contacts)
         self._none: list[BoolArray] = [np.zeros(len(share), dtype=bool) for share in shares]
         self._foreign = [held[here] for held, here in zip(before, shares, strict=True)]
-        both = zip(meeting(contacts, before), shares, strict=True)
-        self._meets = [meets[here] for meets, here in both]
+        met = zip(meeting(contacts, before), shares, strict=True)
+        self._meets = [meets[here] for meets, here in met]
 
     @property
     def had_unknowns(self) -> list[BoolArray]:
@@ -184,35 +183,10 @@ class ContactSearch:
         on = global_max(self._comm, np.array([float(a.any()) for a in self._with_unknowns])) > 0.0
         return set().union(*itertools.compress(self.bodies, on))
 
-    def _placed_at(
-        self, numbers: Sequence[int], u: Sequence[FloatArray]
-    ) -> dict[int, Sequence[FloatArray]]:
-        """Positions of all points of contacts [m], see `ContactPair.positions`. Collective.
-
-        Args:
-            numbers: Of the contacts.
-            u: Owned displacements of all bodies [m].
-        """
-        # What corners touch lies where their pair's surfaces do.
-        first = self._declared
-        pair_of = {k: k if k < first else self._corners[k - first][1] for k in numbers}
-        of: dict[int, tuple[Surface, FloatArray]] = {}
-        for k in pair_of.values():
-            both = zip(self._pairs[k].surfaces, self._of[k], strict=True)
-            of.update((id(surface), (surface, u[b])) for surface, b in both)
-        moved = gather_each(*zip(*of.values(), strict=True)) if of else []
-        ways, found = dict(zip(of, moved, strict=True)), dict[int, Sequence[FloatArray]]()
-        for k, own in pair_of.items():
-            if own not in found:
-                pair = self._pairs[own]
-                found[own] = pair.placed([ways[id(surface)] for surface in pair.surfaces])
-            found[k] = found[own] if k == own else found[own][::-1]
-        return found
-
     def _positions(self, k: int) -> Sequence[FloatArray]:
         """Positions of all points of a contact that is sought, at t_n [m]. Collective."""
         if not self._placed:
-            self._placed = self._placed_at(self._sought, self._step.state.u)
+            self._placed = self._places.at(self._sought, self._step.state.u)
         return self._placed[k]
 
     def _reach(self, k: int, motion: FloatArray) -> float:
@@ -297,7 +271,7 @@ class ContactSearch:
         node, reach = c.candidates.node, self._reach(k, self._step.motion)
         force = self._old[k].force[node]
         if c.law.strong:
-            first = self._placed_at([k], self._step.first)[k]
+            first = self._places.at([k], self._step.first)[k]
             closes = c.gap_at(first, self._paths[k][1]) < -_SURELY * reach
             return closes | (force > no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step, and rounding of
@@ -471,6 +445,6 @@ class ContactSearch:
         self, elements: Sequence[ContactElements], u: Sequence[FloatArray]
     ) -> list[FloatArray]:
         """Gaps of candidates of each contact at displacements of all bodies [m]. Collective."""
-        placed = self._placed_at(self.numbers, u)
+        placed = self._places.at(self.numbers, u)
         both = zip(self.numbers, elements, strict=True)
         return [c.gap_at(placed[k], self._paths[k][1]) for k, c in both]

@@ -261,8 +261,8 @@ class OverlapWatch:
         if near:
             self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
         due = []
-        for (k, looked, where), way in zip(near, relative_way(moved).tolist(), strict=True):
-            looks = way > (0.0 if last else looked.pause.due)
+        for (k, _, where), way in zip(near, relative_way(moved).tolist(), strict=True):
+            looks = way > dues[k]
             if looks:
                 due.append((k, where, way))
             self._ways[k] = 0.0 if looks else way

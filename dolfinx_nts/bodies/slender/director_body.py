@@ -284,8 +284,11 @@ class DirectorBody(ElementForces):
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Loads and gravity [N]; a moment acts on directors where the step takes its forces."""
         f = self.weight(gravity).reshape(-1, self._width)
-        y = self.reference + self._u0 + self._held_at * (u1 - self._u0)
-        self._loads.add_to(f, y, u1)
+        self._loads.add_to(f, u1)
+        moments = self._loads.moments
+        if moments.turned.size:
+            y = self.reference + self._u0 + self._held_at * (u1 - self._u0)
+            f[moments.turned, 3:] += moments.push(y)
         return f.ravel()
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:

@@ -177,17 +177,14 @@ class DirectorLoads:
         self.moments.begin(both[1][self.moments.turned])
         self._pressures.begin(time, ramp)
 
-    def add_to(self, f: FloatArray, y: FloatArray, u1: FloatArray) -> None:
-        """Add to forces on nodal vectors (nodes, width) [N]. Collective.
+    def add_to(self, f: FloatArray, u1: FloatArray) -> None:
+        """Add all but moments to forces on nodal vectors (nodes, width) [N]. Collective.
 
         Args:
             f: They are changed.
-            y: Where the step takes its forces [m], (num_owned,); moments act on directors there.
             u1: Displacement at t_{n+1} [m], (num_owned,).
         """
         f[:, :3] += self._force
-        if self.moments.turned.size:
-            f[self.moments.turned, 3:] += self.moments.push(y)
         if self._pressures:
             elements = self._elements
             on_cells = np.zeros(elements.rest.shape)

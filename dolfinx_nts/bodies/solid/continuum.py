@@ -33,11 +33,7 @@ from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Settings, Values
-from dolfinx_nts.validation import (
-    is_whole,
-    known_options,
-    require_name,
-)
+from dolfinx_nts.validation import is_whole, known_options, require_name
 
 #: Stress of an undeformed body, over its stiffness, that counts as none.
 _STRESS_FREE = 1e-6
@@ -148,8 +144,8 @@ class Continuum(UflBody):
         self.material, self.density, self.viscosity = material, density, viscosity
         self.losses = ("viscous_dissipation",) if viscous else ()
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
-        side = largest_side(self.comm, self.reference)
-        self.rounded = 0.0 if isinstance(material, Isotropic) else side
+        isotropic = isinstance(material, Isotropic)
+        self.rounded = 0.0 if isotropic else largest_side(self.comm, self.reference)
         self.body_force = body_force
         self.loads_in_time = loads.in_time or extra_form is not None or loads.follows
         # A curved cell's volume is a polynomial, too.

@@ -54,7 +54,6 @@ class UflBody(MeshBody):
         allow_inversion: As of `Continuum`.
         viscous: Virtual work of a viscosity, as of `StepForms`.
         following: That of loads that follow the body, as `extra_form`.
-
     """
 
     _mass: MassMatrix
