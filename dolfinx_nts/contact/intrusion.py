@@ -1,4 +1,4 @@
-"""How deep nodes and edges lie in another body, and facets in an obstacle: arrays in, arrays out.
+"""How deep nodes and edges lie in another body: arrays in, arrays out.
 
 The depth of a point inside a body is its distance from the boundary; it changes along an edge by at
 most the way, which bounds it between two points and leaves few edges to look at closely.
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from dolfinx_nts.contact import search
-from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import winding
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels.bounded_slope import highest
@@ -314,16 +313,14 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
     nodes = np.column_stack([node[i], node[i]])
     inside = Found(nodes, a.x[node[i]], depth, depth / scale, at.facet[i], np.zeros(len(i), bool))
     start, limit = at.value[end], least * np.maximum(size, floor)
-    middle, normal = _straddles(at, end), at.normal[end[:, 0]]
+    middle = _through(ends, at, end, b, part)
     limit[middle] *= _THIN
     kept = ~deep[end].any(axis=1) & (start.sum(axis=1) + length > 2.0 * limit)
-    ends, size, start, limit, near, middle, normal = (
-        v[kept] for v in (ends, size, start, limit, near, middle, normal)
+    ends, size, start, limit, near, middle = (
+        v[kept] for v in (ends, size, start, limit, near, middle)
     )
     place, depth, facet = _deepest(ends, start, limit, b, part)
     size = np.maximum(size, sizes[facet])
-    # What comes a little into the narrow side of a plate is nearer to that than to its middle.
-    middle &= np.abs(_cosine(b.normals(facet), normal)) > -_OPPOSITE
     deep = depth > np.where(middle, limit, least * size)
     # Where the middle of a body is passed, half its thickness is the depth.
     size = np.where(middle, np.maximum(depth / size, 0.5), depth / size)
@@ -347,10 +344,31 @@ def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
     return np.flatnonzero(_meet(ends.min(axis=1), ends.max(axis=1), inner))
 
 
-def _straddles(at: Depth, end: IntArray) -> BoolArray:
-    """Whether the ends (n, 2) of edges are over facets that face opposite ways, shape (n,)."""
+def _through(
+    ends: FloatArray, at: Depth, end: IntArray, b: Placed, chosen: IntArray
+) -> BoolArray:
+    """Which edges have ends over two opposite sides of a body, of which one is nearest halfway.
+
+    What comes a little into the narrow side of a plate is nearest to that all the way.
+
+    Args:
+        ends: Of the edges [m], shape (n, 2, 3).
+        at: Depths of nodes.
+        end: Which of these are the ends, shape (n, 2).
+        b: The body.
+        chosen: Its facets that are near.
+    """
     one, two = at.normal[end].transpose(1, 0, 2)
-    return (_cosine(one, two) < _OPPOSITE) & at.over[end].all(axis=1)
+    found = (_cosine(one, two) < _OPPOSITE) & at.over[end].all(axis=1)
+    start, normal = at.value[end[found]], one[found]
+    span = ends[found, 1] - ends[found, 0]
+    across = np.abs(np.einsum("ni,ni->n", span, normal)) / np.linalg.norm(normal, axis=1)
+    part = np.divide(start[:, 1] - start[:, 0], across, np.zeros_like(across), where=across > 0.0)
+    halfway = ends[found, 0] + (0.5 + 0.5 * np.clip(part, -1.0, 1.0))[:, None] * span
+    there = b.depth(halfway, np.linalg.norm(span, axis=1), chosen)
+    side = np.abs(_cosine(b.normals(there.facet), normal)) > -_OPPOSITE
+    found[found] = side & (there.value > 0.0)
+    return found
 
 
 def _cosine(one: FloatArray, two: FloatArray) -> FloatArray:
@@ -390,52 +408,3 @@ def _deepest(
         found = depth(deep, at[deep], 2.0 * value[deep])
         value[deep], facet[deep] = found.value, found.facet
     return ends[:, 0] + at[:, None] * span, value, facet
-
-
-def sunk(
-    obstacle: Obstacle, corners: FloatArray, limit: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Deepest points of facets in an obstacle.
-
-    A facet is made of straight lines between two opposite sides, or from a corner of a triangle to
-    the side opposite. How deep the deepest point of each lies changes by no more than the way of
-    its ends.
-
-    Args:
-        obstacle: The obstacle.
-        corners: Corners of the facets relative to its motion [m], shape (m, nc, 3).
-        limit: Depth of interest [m], > 0, shape (m,).
-
-    Returns:
-        Points [m] (m, 3) and their depths [m] (m,), to one part in a hundred of the depth; where
-        nothing is as deep as the limit, of some point.
-    """
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    d = corners[:, -1] if corners.shape[1] == 4 else a
-    length = np.linalg.norm([d - a, c - b], axis=2).max(axis=0)
-
-    def line(facet: IntArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        one, two = (p[facet] + s[:, None] * (q - p)[facet] for p, q in ((a, d), (b, c)))
-        return one, two
-
-    # Bounds, because a line that is taken for less deep than it is hides those beside it.
-    start = np.column_stack(
-        [obstacle.depth_bound(a, b, limit), obstacle.depth_bound(d, c, limit)]
-    )
-    at, depth = highest(
-        lambda facet, s, _: obstacle.depth_bound(*line(facet, s), limit[facet]),
-        start, length, limit,
-    )  # fmt: skip
-    place: FloatArray = corners.mean(axis=1)
-    deep = np.flatnonzero(depth > limit)
-    if deep.size:
-        one, two = line(deep, at[deep])
-        span = two - one
-        along, _ = highest(
-            lambda k, s, _: -obstacle.gap(one[k] + s[:, None] * span[k]).value,
-            -np.column_stack([obstacle.gap(one).value, obstacle.gap(two).value]),
-            np.linalg.norm(span, axis=1),
-            limit[deep],
-        )
-        place[deep] = one + along[:, None] * span
-    return place, depth

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.contact.crossings import Finding, Pause, belong, places, point
-from dolfinx_nts.contact.intrusion import LEAST, Boundary, Placed, sunk
+from dolfinx_nts.contact.intrusion import LEAST, Boundary, Placed
+from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.kernels.bounded_slope import highest
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: So many points of an obstacle are looked for in a body, each next to another of the body's.
@@ -349,3 +351,52 @@ def _shared(surface: Surface, declared: Sequence[Surface]) -> BoolArray:
     number = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
     own = len(surface.facets)
     return np.isin(number[-own:], number[:-own])
+
+
+def sunk(
+    obstacle: Obstacle, corners: FloatArray, limit: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Deepest points of facets in an obstacle.
+
+    A facet is made of straight lines between two opposite sides, or from a corner of a triangle to
+    the side opposite. How deep the deepest point of each lies changes by no more than the way of
+    its ends.
+
+    Args:
+        obstacle: The obstacle.
+        corners: Corners of the facets relative to its motion [m], shape (m, nc, 3).
+        limit: Depth of interest [m], > 0, shape (m,).
+
+    Returns:
+        Points [m] (m, 3) and their depths [m] (m,), to one part in a hundred of the depth; where
+        nothing is as deep as the limit, of some point.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    d = corners[:, -1] if corners.shape[1] == 4 else a
+    length = np.linalg.norm([d - a, c - b], axis=2).max(axis=0)
+
+    def line(facet: IntArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        one, two = (p[facet] + s[:, None] * (q - p)[facet] for p, q in ((a, d), (b, c)))
+        return one, two
+
+    # Bounds, because a line that is taken for less deep than it is hides those beside it.
+    start = np.column_stack(
+        [obstacle.depth_bound(a, b, limit), obstacle.depth_bound(d, c, limit)]
+    )
+    at, depth = highest(
+        lambda facet, s, _: obstacle.depth_bound(*line(facet, s), limit[facet]),
+        start, length, limit,
+    )  # fmt: skip
+    place: FloatArray = corners.mean(axis=1)
+    deep = np.flatnonzero(depth > limit)
+    if deep.size:
+        one, two = line(deep, at[deep])
+        span = two - one
+        along, _ = highest(
+            lambda k, s, _: -obstacle.gap(one[k] + s[:, None] * span[k]).value,
+            -np.column_stack([obstacle.gap(one).value, obstacle.gap(two).value]),
+            np.linalg.norm(span, axis=1),
+            limit[deep],
+        )
+        place[deep] = one + along[:, None] * span
+    return place, depth

@@ -199,11 +199,17 @@ def test_a_post_that_ends_in_a_plate_is_told_from_its_middle_on(at, cells):
             assert np.allclose(found.depth, 0.01, rtol=0.021) and np.allclose(found.size, 0.5)
 
 
-def test_what_comes_a_little_into_the_narrow_side_of_a_plate_is_not_past_its_middle():
+@pytest.mark.parametrize(("above", "lean"), [(0.3, 0.0), (0.021, 0.0), (0.021, 0.2)])
+def test_what_comes_a_little_into_the_narrow_side_of_a_plate_is_not_past_its_middle(above, lean):
+    """Also where it is hardly longer than the plate is thick, as the tooth of a soft gear.
+
+    Where it leans, its deepest point is as near to the upper side as to the narrow one.
+    """
     plate = box((-1, -1, -0.02), (1, 1, 0.02), (8, 8, 1))
-    for depth, told in ((0.004, False), (0.015, False), (0.04, True)):
-        post = box((1 - depth, -0.1, -0.3), (1.2, 0.13, 0.3), (1, 1, 1))
-        assert bool(count(post, plate)) == told
+    for depth, told in ((0.004, False), (0.008, False), (0.015, False), (0.045, True)):
+        post = box((1 - depth, -0.1, -above), (1.2, 0.13, above), (1, 1, 1))
+        leaning = post.x - lean * post.x[:, 2:] * [1, 0, 0]
+        assert bool(count(intrusion.Placed(post.boundary, leaning), plate)) == told
 
 
 def test_a_facet_counts_up_to_the_width_of_a_body_in_it():
@@ -669,7 +675,7 @@ def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
                 if hasattr(scaled, name):
                     object.__setattr__(scaled, name, metre * np.array(getattr(scaled, name)))
             place, depth = (
-                v / metre for v in intrusion.sunk(scaled, metre * c, metre * limit)
+                v / metre for v in obstacle_crossings.sunk(scaled, metre * c, metre * limit)
             )
             deep = depth > limit
             sure = np.abs(true / limit - 1) > 0.02
@@ -694,7 +700,7 @@ def test_a_ball_between_nodes_is_found_by_its_gap_alone(nc, known):
         depth, limit = r - abs(centre[2]), 0.2 * r
         if depth > 1.02 * limit:
             ball = Ball(centre, r, width=r if known else np.inf)
-            _, found = intrusion.sunk(ball, corners, np.array([limit]))
+            _, found = obstacle_crossings.sunk(ball, corners, np.array([limit]))
             assert abs(found[0] - depth) < 0.011 * depth
             found_any += 1
     assert found_any > 33
@@ -846,7 +852,7 @@ def test_obstacles_are_looked_at_as_rarely_as_the_motion_allows(monkeypatch):
     """Not far away; else after a quarter of the radius."""
     ball, looks = nts.Sphere((0.5, 0.5, -0.45), 0.4), []
     system = above(ball)
-    watch, true = overlap.OverlapWatch(system), intrusion.sunk
+    watch, true = overlap.OverlapWatch(system), obstacle_crossings.sunk
     monkeypatch.setattr(obstacle_crossings, "sunk", lambda *a: looks.append(1) or true(*a))
 
     def look(z, **options):
