@@ -19,9 +19,10 @@ from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
 from dolfinx_nts.contact.shared_nodes import carried_area, check_shared
+from dolfinx_nts.contact.valleys import valleys_of
 from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels, together
-from dolfinx_nts.state import EdgeHistory, State
+from dolfinx_nts.state import ContactHistory, EdgeHistory, State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
@@ -108,9 +109,12 @@ class System:
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
-        corners = [(k, c) for k, pair in enumerate(self.contacts) for c in corners_of(pair)]
-        self.pairs = (*self.contacts, *(c for _, c in corners))
-        self.contact_of = [*range(len(self.contacts)), *(k for k, _ in corners)]
+        added = [
+            (k, c) for k, pair in enumerate(self.contacts)
+            for c in (*corners_of(pair), *valleys_of(pair))
+        ]  # fmt: skip
+        self.pairs = (*self.contacts, *(c for _, c in added))
+        self.contact_of = [*range(len(self.contacts)), *(k for k, _ in added)]
         self.pair_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.pairs]
         self.edges: dict[int, EdgeContact] = {}
         for k, (pair, numbers) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
@@ -218,8 +222,19 @@ class System:
             Shape (contacts, ...).
         """
         found = values[: len(self.contacts)].copy()
-        # Corners are those of masters.
-        np.subtract.at(found, np.array(self.contact_of[len(found) :], int), values[len(found) :])
+        added = self.pairs[len(found) :]
+        signs = np.array([-1.0 if pair.exchanged else 1.0 for pair in added])
+        signs = signs.reshape(-1, *[1] * (values.ndim - 1))
+        np.add.at(found, np.array(self.contact_of[len(found) :], int), signs * values[len(found) :])
+        return found
+
+    def of_slaves(self, histories: Sequence[ContactHistory]) -> list[ContactHistory]:
+        """What each of its contacts remembers of its slave nodes, from that of each of `pairs`."""
+        n = len(self.contacts)
+        found = list(histories[:n])
+        for k, pair, more in zip(self.contact_of[n:], self.pairs[n:], histories[n:], strict=True):
+            if not pair.exchanged:
+                found[k] = found[k].beside(more)
         return found
 
     def slave_area(self, k: int, state: State) -> FloatArray:
