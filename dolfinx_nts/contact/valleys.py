@@ -36,8 +36,9 @@ class Valleys(FacetPair):
     def __init__(self, of: FacetPair, before: Sequence[FacetPair] = ()) -> None:
         self.of, self._before = of, (of, *before)
         super().__init__(
-            of.slave, of.master, friction=of.friction_function or of.friction, name=of.name
-        )
+            of.slave, of.master, friction=of.friction_function or of.friction,
+            interference=of.interference, name=of.name,
+        )  # fmt: skip
         # Points are where they are for the pair.
         self.origin, self.extent = of.origin, of.extent
         self.late = bool(before)
