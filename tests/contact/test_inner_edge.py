@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from gmsh_parts import of_gmsh
+from rotations import rotation
 from scenes import RUBBER, at, box, everywhere
 
 import dolfinx_nts as nts
@@ -91,7 +92,7 @@ def sum_of(field, comm):
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_overlap_with_both_faces_is_pressed_out(friction):
-    """A cube fixed on its far sides that starts inside floor and wall, as with a contact for each."""
+    """A cube held on its far sides that starts in floor and wall: as with a contact for each."""
     floor, wall = at(2, 0.0), at(0, 1.0)
 
     def fitted(masters):
@@ -116,6 +117,34 @@ def test_overlap_with_both_faces_is_pressed_out(friction):
         assert one.balance[name] == pytest.approx(each.balance[name], rel=1e-9), name
     forces = [run.contact_forces[-1].sum(axis=0) for run in (one, each)]
     assert np.allclose(*forces, rtol=0.0, atol=1e-9 * np.abs(forces[0]).max())
+
+
+@pytest.mark.mpi
+def test_a_bar_slides_down_a_v_groove():
+    """Flanks of 45 degrees bear W cos(slope)/sqrt(2) each: friction is sqrt(2) mu W cos(slope).
+
+    Whole boundaries are declared, so that nodes of the bar's lower edge touch both flanks.
+    """
+
+    def draw(occ):
+        block = occ.addBox(-0.5, -0.3, -0.3, 2, 0.6, 0.5)
+        cut = occ.addBox(-1, -0.4, -0.4, 3, 0.8, 0.8)
+        occ.rotate([(3, cut)], 0, 0, 0, 1, 0, 0, np.pi / 4)
+        occ.translate([(3, cut)], 0, 0, 0.4 * np.sqrt(2))
+        return occ.cut([(3, block)], [(3, cut)])[0]
+
+    friction, slope, still = 0.1, np.radians(20.0), (0.0, 0.0, 0.0)
+    groove = of_gmsh(draw, 0.2).rigid(density=1e3, motion=still, rotation=still, name="groove")
+    mesh = box([0, 0, 0], [0.4, 0.2, 0.2], [4, 2, 2])
+    mesh.geometry.x[:] = mesh.geometry.x @ rotation(np.pi / 4, (1, 0, 0)).T
+    bar = nts.RigidBody(mesh, density=1e3, name="bar")
+    pair = nts.ContactPair(bar.surface(everywhere), groove.surface(everywhere), friction=friction)
+    gravity = 9.81 * np.array([np.sin(slope), 0.0, -np.cos(slope)])
+    system = nts.System([bar, groove], contacts=[pair], gravity=gravity)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.3)
+    assert run.status == "completed"
+    speed = 0.3 * 9.81 * (np.sin(slope) - np.sqrt(2.0) * friction * np.cos(slope))
+    assert bar.velocity == pytest.approx([speed, 0.0, 0.0], abs=1e-8 * speed)
 
 
 def within(x):
