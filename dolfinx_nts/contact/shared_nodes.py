@@ -134,6 +134,6 @@ def _beside(contacts: Sequence[ContactPair]) -> Iterator[tuple[int, int, str]]:
         one, two = contacts[i], contacts[j]
         what: Any = one.shares_master(two)
         # What is added to a contact holds its nodes out of other facets.
-        apart = (one.of or one) is not (two.of or two)
-        if what and apart and np.isin(one.slave.points, two.slave.points).any():
+        added = (one.of or two.of) and (one.of or one) is (two.of or two)
+        if what and not added and np.isin(one.slave.points, two.slave.points).any():
             yield i, j, what
