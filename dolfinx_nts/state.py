@@ -42,6 +42,16 @@ class ContactHistory(NamedTuple):
             none.copy(),
         )
 
+    def beside(self, other: ContactHistory) -> ContactHistory:
+        """What both know of the same nodes: forces in all, and the smaller gap."""
+        carry, sticks = self.force > 0.0, (self.force <= 0.0) | self.stick
+        return self._replace(
+            force=self.force + other.force, gap=np.minimum(self.gap, other.gap),
+            tangential=self.tangential + other.tangential,
+            stick=np.where(other.force > 0.0, sticks & other.stick, self.stick & carry),
+            slip=np.maximum(self.slip, other.slip),
+        )  # fmt: skip
+
 
 class EdgeHistory(NamedTuple):
     """What the edges of a contact remember that press on each other, on this rank; axis 0 = pair.

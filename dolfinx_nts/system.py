@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -19,9 +20,10 @@ from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
 from dolfinx_nts.contact.shared_nodes import carried_area, check_shared
+from dolfinx_nts.contact.valleys import valleys_of
 from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels, together
-from dolfinx_nts.state import EdgeHistory, State
+from dolfinx_nts.state import ContactHistory, EdgeHistory, State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
@@ -29,6 +31,13 @@ from dolfinx_nts.validation import items, known_options, require_same, vector
 _SAGS = 1.1
 #: Names of a kind that its one-line description shows.
 _SHOWN = 8
+
+
+class _Over(NamedTuple):
+    """What slaves of a contact lie over."""
+
+    pair: ContactPair
+    candidates: Candidates
 
 
 @known_options
@@ -108,9 +117,12 @@ class System:
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
-        corners = [(k, c) for k, pair in enumerate(self.contacts) for c in corners_of(pair)]
-        self.pairs = (*self.contacts, *(c for _, c in corners))
-        self.contact_of = [*range(len(self.contacts)), *(k for k, _ in corners)]
+        added = [
+            (k, c) for k, pair in enumerate(self.contacts)
+            for c in (*corners_of(pair), *valleys_of(pair))
+        ]  # fmt: skip
+        self.pairs = (*self.contacts, *(c for _, c in added))
+        self.contact_of = [*range(len(self.contacts)), *(k for k, _ in added)]
         self.pair_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.pairs]
         self.edges: dict[int, EdgeContact] = {}
         for k, (pair, numbers) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
@@ -218,8 +230,19 @@ class System:
             Shape (contacts, ...).
         """
         found = values[: len(self.contacts)].copy()
-        # Corners are those of masters.
-        np.subtract.at(found, np.array(self.contact_of[len(found) :], int), values[len(found) :])
+        added = self.pairs[len(found) :]
+        signs = np.array([-1.0 if pair.exchanged else 1.0 for pair in added])
+        signs = signs.reshape(-1, *[1] * (values.ndim - 1))
+        np.add.at(found, np.array(self.contact_of[len(found) :], int), signs * values[len(found) :])
+        return found
+
+    def of_slaves(self, histories: Sequence[ContactHistory]) -> list[ContactHistory]:
+        """What each of its contacts remembers of its slave nodes, from that of each of `pairs`."""
+        n = len(self.contacts)
+        found = list(histories[:n])
+        for k, pair, more in zip(self.contact_of[n:], self.pairs[n:], histories[n:], strict=True):
+            if not pair.exchanged:
+                found[k] = found[k].beside(more)
         return found
 
     def slave_area(self, k: int, state: State) -> FloatArray:
@@ -243,25 +266,29 @@ class System:
             Of each contact, shape (points,), the same on all ranks; 0 outside and, but for
             obstacles, deep inside.
         """
-        depths = []
-        both = zip(self.contacts, self._facing(state), state.contacts, strict=False)
-        for pair, found, history in both:
-            deep = np.maximum(-found.gap - left * history.overlap[found.node], 0.0)
-            depth = np.zeros(len(pair.slave.points))
-            depth[pair.slave.share[found.node]] = deep / found.length
+        depths = [np.zeros(len(pair.slave.points)) for pair in self.contacts]
+        for n, found in self._facing(state):
+            overlap, k = state.contacts[n].overlap[found.node], self.contact_of[n]
+            deep = np.maximum(-found.gap - left * overlap, 0.0) / found.length
+            at = self.pairs[n].slave.share[found.node]
+            depths[k][at] = np.maximum(depths[k][at], deep)
+        for depth in depths:
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
-            depths.append(depth)
         return depths
 
-    def _facing(self, state: State) -> Iterator[Candidates]:
-        """What this rank's slaves of each contact lie over, where they are. Collective."""
-        for pair, bodies, history in zip(
-            self.contacts, self.contact_bodies, state.contacts, strict=False
-        ):
+    def _facing(self, state: State) -> Iterator[tuple[int, Candidates]]:
+        """What this rank's slaves lie over, where they are, by numbers of `pairs`. Collective."""
+        over: dict[int, list[_Over]] = {}
+        for n, (pair, bodies) in enumerate(zip(self.pairs, self.pair_bodies, strict=True)):
+            if pair.exchanged:
+                continue
+            together(self.comm, [pair.leave_to(over, None)])
             positions = pair.positions([state.u[b] for b in bodies])
             path = pair.path(state.time, state.time)
-            (found,) = together(self.comm, [pair.find(positions, history.facet, path)])
-            yield found.candidates
+            asked = pair.find(positions, state.contacts[n].facet, path)
+            candidates = together(self.comm, [asked])[0].candidates
+            over.setdefault(id(pair.slave.body), []).append(_Over(pair, candidates))
+            yield n, candidates
 
     def with_overlap(self, state: State, left: float) -> State:
         """The state with the overlap of nodes that no load step has known, see `ContactHistory`.
@@ -278,13 +305,13 @@ class System:
         if not left:
             self.refuse_overlap(state)
             return state
-        contacts = []
-        for found, history in zip(self._facing(state), state.contacts, strict=False):
-            new, node = np.zeros_like(history.overlap), found.node
-            new[node] = np.maximum(-found.gap, 0.0) / left
-            known = np.isfinite(history.gap)
-            contacts.append(history._replace(overlap=np.where(known, history.overlap, new)))
-        return replace(state, contacts=(*contacts, *state.contacts[len(contacts) :]))
+        contacts = list(state.contacts)
+        for n, found in self._facing(state):
+            old = contacts[n]
+            new, known = np.zeros_like(old.overlap), np.isfinite(old.gap)
+            new[found.node] = np.maximum(-found.gap, 0.0) / left
+            contacts[n] = old._replace(overlap=np.where(known, old.overlap, new))
+        return replace(state, contacts=tuple(contacts))
 
     def refuse_overlap(self, state: State) -> None:
         """Raise on every rank if slaves are inside a master where no load steps press them out."""

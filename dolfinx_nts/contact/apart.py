@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Obstacle
@@ -42,7 +41,7 @@ class Apart:
         numbers_of, least = [], []
         for k, (pair, numbers) in enumerate(zip(contacts, bodies, strict=True)):
             # Corners are on the surfaces of their contact, with the roles exchanged.
-            surfaces = pair.of.surfaces[::-1] if isinstance(pair, Corners) else pair.surfaces
+            surfaces = pair.of.surfaces[::-1] if pair.of and pair.exchanged else pair.surfaces
             obstacle = isinstance(pair, ObstaclePair) and not pair.driven
             known = (isinstance(pair, FacetPair) or obstacle) and pair.holds_nodes
             if not (known and all(len(surface.points) for surface in surfaces)):

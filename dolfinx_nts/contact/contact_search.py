@@ -17,12 +17,12 @@ import numpy as np
 from dolfinx_nts.contact.apart import Apart
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
-from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.placed import Placed
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
+from dolfinx_nts.contact.valleys import tell_met
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -62,10 +62,8 @@ class ContactSearch:
         self.numbers, self.bodies = list[int](), list[tuple[int, ...]]()
         self.elements, self.idle = list[ContactElements](), list[ContactElements]()
         self.idle_gaps: list[FloatArray] = []
-        self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
+        self._declared = sum(pair.of is None for pair in contacts)
         self._places, self._edges = Placed(contacts, bodies), edges
-        both = zip(contacts, self._places.own, strict=True)
-        self._corners = [(c, own) for c, own in both if isinstance(c, Corners)]
         self.edges: dict[int, EdgeCoupling] = {}
         self._apart = Apart(contacts, bodies)
         self._sought: list[int] = []
@@ -135,15 +133,16 @@ class ContactSearch:
         had, declared = self.had_unknowns, [k for k in self._sought if k < self._declared]
         found: dict[int, Any] = self._search(declared)
         drop_doubles(found, self._old)
-        slaves: dict[int, list[ContactElements]] = {}
-        for c in found.values():
-            slaves.setdefault(id(c.pair.slave.body), []).append(c)
-        left, of_corners = [], self._sought[len(declared) :]
-        for corners, of in (self._corners[k - self._declared] for k in of_corners):
-            meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=np.int64)
-            left.append(corners.leave_to(slaves.get(id(corners.master.body), []), meet))
-        together(self._comm, left)
-        found |= self._search(of_corners)
+        for late in (False, True):
+            slaves: dict[int, list[ContactElements]] = {}
+            for c in found.values():
+                slaves.setdefault(id(c.pair.slave.body), []).append(c)
+            added = [k for k in self._sought[len(declared) :] if self._pairs[k].late is late]
+            together(self._comm, [
+                self._pairs[k].leave_to(slaves, self._edges.get(self._places.own[k])) for k in added
+            ])  # fmt: skip
+            found |= self._search(added)
+        tell_met(found, self._places.own)
         self.numbers, self._found = list(found), list(found.values())
         self._apart.found(self.numbers)
         self.bodies = [self._of[k] for k in found]

@@ -1,4 +1,4 @@
-"""Edges at which a master turns away from its slaves: its facets' planes go on, the body does not.
+"""Edges of a master: where it turns away from its slaves, facets' planes go on, the body does not.
 
 A node that touches a facet slides on to the next one over the edges of a curved surface. Over a
 sharp convex edge it leaves the body, and what crosses a facet's plane beyond such an edge passes
@@ -20,6 +20,9 @@ OUTSIDE = 1e-6
 #: Least cosine between normals of facets whose convex edge is one of a curved surface, such as a
 #: cylinder of twelve facets; that of an inner edge is `patches.SHARP`.
 SHARP = 0.85
+#: That of facets at an inner edge, in which a node is held out of both. In a bore of facets one
+#: that slides is behind the next one for a step, by less than they sag.
+INNER = 0.7
 #: What hits a facet so near to a sharp edge, in ways that it slides in a step, passes beside it.
 _GRAZES = 1e-2
 #: Over so many facets of a curved surface a node is followed to its sharp edge.
@@ -36,18 +39,22 @@ class ConvexEdges:
     Attributes:
         joined: As of `patches.neighbours`, without sharp edges.
         sharp: Which facets have a sharp edge, shape (m,).
+        inner: Ends of the edges at which the master turns towards its slaves, shape (n, 2).
     """
 
     def __init__(self, at: IntArray, corners: FloatArray) -> None:
         self._at = at
         self.joined = patches.neighbours(at, corners)
         self.beside = patches.neighbours(at, corners, sharp=-np.inf)
-        one, two, edge = self.smooth
-        place, normal = middles(corners)
+        nc, (one, edge) = at.shape[1], np.nonzero(self.beside >= 0)
+        two, (place, normal) = self.beside[one, edge] // nc, middles(corners)
         rise = np.einsum("ni,ni->n", place[two] - place[one], normal[one])
         cosine = np.einsum("ni,ni->n", normal[one], normal[two])
         turns = (rise < 0.0) & (cosine < SHARP)
         self.joined[one[turns], edge[turns]] = -1
+        meets = (rise > 0.0) & (cosine < INNER) & (one < two)
+        ends = np.stack([at, np.roll(at, -1, axis=1)], axis=2)
+        self.inner: IntArray = ends[one, edge][meets]
         self.sharp: BoolArray = ((self.beside >= 0) & (self.joined < 0)).any(axis=1)
 
     @property

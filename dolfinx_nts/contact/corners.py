@@ -6,7 +6,7 @@ nodes with facets once more, with the roles exchanged.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,9 @@ class Corners(FacetPair):
         of: The pair, whose options it has.
     """
 
+    of: FacetPair
+    exchanged = True
+
     def __init__(self, of: FacetPair) -> None:
         self.of = of
         super().__init__(
@@ -65,17 +68,12 @@ class Corners(FacetPair):
         return float(global_sum(self.slave.body.comm, history.force.sum(keepdims=True))[0])
 
     def leave_to(
-        self, nodes: Sequence[ContactElements], meet: IntArray
+        self, slaves: Mapping[int, Sequence[ContactElements]], edges: Any
     ) -> Asking[None]:
-        """Note what else holds in a step, before `find`, as of `together`.
-
-        Args:
-            nodes: Those of the contacts in which the body is a slave. What holds nodes of rigid
-                bodies elsewhere may leave with them.
-            meet: Ends of edges that may meet, two points of the master and two of the slave,
-                shape (k, 4).
-        """
-        at, self._meet = self.master.points, meet
+        """As of `ContactPair`; what holds nodes of rigid bodies elsewhere may leave with them."""
+        # Ends of edges that may meet: two points of the master and two of the slave.
+        self._meet = edges.ends if edges else np.empty((0, 4), dtype=np.int64)
+        at, nodes = self.master.points, slaves.get(id(self.master.body), [])
         # From all points of the body that is the slave to where they touch what may hold them.
         self._ways, self._near = np.zeros((len(at), 3)), np.zeros(len(at), dtype=bool)
         for elements in nodes:
@@ -111,7 +109,7 @@ class Corners(FacetPair):
 
         Args:
             point: The corners, shape (n,).
-            k: Numbers of what meets, see `leave_to`, shape (n,).
+            k: Numbers of edges' ends that may meet, shape (n,).
             x: Points of the slave [m].
             normal: Of the facets, shape (n, 3).
         """

@@ -24,8 +24,8 @@ class Finding(NamedTuple):
 
     Attributes:
         kind: "edge through a body", "node inside a body", "facet in an obstacle", "node in an
-            obstacle", "obstacle in a body", "facet starts in an obstacle", "contact inside a rim"
-            or "node in an inner edge".
+            obstacle", "obstacle in a body", "facet starts in an obstacle" or "contact inside a
+            rim".
         depth: Of the deepest point, or of a contact the distance from the rim [m].
         size: The same in facet sizes, of a contact in widths of the slave's surface [-].
         place: Where it is [m], shape (3,).

@@ -17,9 +17,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
-from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.overhang import FLAT, inside_rim
 from dolfinx_nts.contact.self_crossings import SelfPair
@@ -72,8 +70,8 @@ class OverlapWatch:
 
     def __init__(self, system: Any) -> None:
         self._comm, self._bodies, self._along = system.comm, system.bodies, system.edges
-        self._edges: dict[int, InnerEdges] = {}
-        self._corners = [(n, c) for n, c in enumerate(system.pairs) if isinstance(c, Corners)]
+        self._of_slaves = system.of_slaves
+        self._corners = [(n, c) for n, c in enumerate(system.pairs) if c.exchanged]
 
         @cache
         def start() -> tuple[FloatArray, ...]:
@@ -139,19 +137,19 @@ class OverlapWatch:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
             time: At which they are so [s].
             contacts: What each of `System.pairs` remembers; may be left out, and then contact
-                inside a rim or in an inner edge is not told.
+                inside a rim is not told.
             edges: What the edges of each contact remember; left out with `contacts`.
             last: Look again wherever anything has moved.
         """
         findings: list[Finding] = []
-        forces = _Everywhere(self._contacts, contacts)
+        forces = _Everywhere(self._contacts, self._of_slaves(contacts) if contacts else ())
         for k, where, way in self._due(u, time, last):
             before, pair = self._looked.get(k), self._pairs[k]
             found, pause = pair.look(where)
             if before and way > before.pause.clear + before.pause.through:
                 found += pair.passed(before.where, where, way, before.pause.through)
             findings += [f for f in found if f.depth > self._allowed[k]]
-            # Obstacles have no rim and no inner edge.
+            # Obstacles have no rim.
             if contacts and isinstance(pair, BodyPair):
                 findings += self._of_contacts(pair, u, forces, contacts, edges)
             self._looked[k], self._dues[k] = _Looked(where, pause), pause.due
@@ -172,7 +170,7 @@ class OverlapWatch:
     ) -> Iterator[Finding]:
         """What is told of contacts by their forces. Collective.
 
-        That one ends inside the rim of a master, and that nodes lie in inner edges of one.
+        That one ends inside the rim of a master.
 
         Args:
             pair: The bodies between which they are.
@@ -196,15 +194,13 @@ class OverlapWatch:
                 continue
             where = [u[b] for b in bodies]
             positions = contact.positions(where)
-            if k not in self._edges:
-                self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
             rim = inside_rim(contact, positions, carry, held, borne)
             # Edges that cross will carry at the rim as soon as the body has tipped so far.
             if rim and k in self._along and self._along[k].meets(where, FLAT, carry > 0.0):
                 rim = None
-            inner = in_inner_edge(self._edges[k], contact, positions, everywhere[k])
-            yield from filter(None, (rim, inner))
+            if rim:
+                yield rim
 
     def _held_otherwise(self, k: int, forces: _Everywhere) -> BoolArray:
         """Which points of contact k's slave carry in another contact, shape (p,).

@@ -7,7 +7,7 @@ A `ContactPair` is part of the scene and holds no history. What depends on the m
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -162,6 +162,12 @@ class ContactPair:
     holds_nodes: ClassVar[bool] = True
     #: What of the slave is kept out.
     integration: ClassVar[str] = "nodes"
+    #: The contact that it is added to, whose surfaces it has; None: it is declared.
+    of: ContactPair | None = None
+    #: Of one that is added: whether its slave is on the contact's master.
+    exchanged: ClassVar[bool] = False
+    #: Of one that is added: whether it is sought after others that are.
+    late: bool = False
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 
@@ -379,6 +385,15 @@ class ContactPair:
             followed: Which of the rank's nodes were followed in the last step; None: all.
         """
         raise NotImplementedError
+
+    def leave_to(self, slaves: Mapping[int, Sequence[Any]], edges: Any) -> Asking[None]:
+        """Note what else holds in a step, of one that is added, before `find`; as of `together`.
+
+        Args:
+            slaves: Elements of contacts in which a body is the slave, by the body's id.
+            edges: The contact's edges that are near each other, or None.
+        """
+        yield from ()
 
     def elements(
         self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step

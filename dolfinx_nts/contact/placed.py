@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.types import FloatArray
@@ -24,7 +23,7 @@ class Placed:
     def __init__(self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]]) -> None:
         number = {id(pair): k for k, pair in enumerate(contacts)}
         # What corners touch lies where their pair's surfaces do.
-        self.own = [number[id(c.of if isinstance(c, Corners) else c)] for c in contacts]
+        self.own = [number[id(c.of or c)] for c in contacts]
         self._pairs, self._bodies = contacts, bodies
 
     def at(
@@ -48,5 +47,5 @@ class Placed:
                 pair = self._pairs[own]
                 found[own] = pair.placed([ways[id(surface)] for surface in pair.surfaces])
             if own != k:
-                found[k] = found[own][::-1]
+                found[k] = found[own][:: -1 if self._pairs[k].exchanged else 1]
         return found

@@ -68,7 +68,9 @@ def meeting(contacts: Sequence[ContactPair], held: Sequence[BoolArray]) -> list[
         Of each contact, shape (points,).
     """
     found = [np.zeros(len(c.slave.points), dtype=bool) for c in contacts]
-    for i, j in _of_one_body({k: c for k, c in enumerate(contacts) if not c.redundant}):
+    # Which nodes a contact shares with what is added to it changes from step to step.
+    some = {k: c for k, c in enumerate(contacts) if not (c.redundant or c.of and not c.exchanged)}
+    for i, j in _of_one_body(some):
         one, two = contacts[i].slave.points, contacts[j].slave.points
         both = np.intersect1d(one[~held[i]], two[~held[j]])
         found[i] |= np.isin(one, both)
@@ -131,5 +133,7 @@ def _beside(contacts: Sequence[ContactPair]) -> Iterator[tuple[int, int, str]]:
     for i, j in _of_one_body(dict(enumerate(contacts))):
         one, two = contacts[i], contacts[j]
         what: Any = one.shares_master(two)
-        if what and np.isin(one.slave.points, two.slave.points).any():
+        # What is added to a contact holds its nodes out of other facets.
+        added = (one.of or two.of) and (one.of or one) is (two.of or two)
+        if what and not added and np.isin(one.slave.points, two.slave.points).any():
             yield i, j, what

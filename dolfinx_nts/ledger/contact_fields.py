@@ -52,10 +52,8 @@ class ContactLoads(NamedTuple):
         total = [np.zeros((len(surface.points), 3)) for surface in pair.surfaces]
         for c, part in self.elements.get(k, ()):
             forces = c.nodal_forces(part)
-            # Corners are the master's.
-            for all_forces, own in zip(
-                total, forces if c.pair is pair else forces[::-1], strict=True
-            ):
+            turned = -1 if c.pair.exchanged else 1
+            for all_forces, own in zip(total, forces[::turned], strict=True):
                 all_forces += own
         for surface, force in zip(pair.surfaces, total, strict=True):
             surface.body.comm.Allreduce(MPI.IN_PLACE, force, op=MPI.SUM)
@@ -107,6 +105,7 @@ def at_nodes(
         By name, see `Solution.contact_fields`, shape (nodes,) or (nodes, 3).
     """
     fields: dict[str, FloatArray] = {}
+    histories = system.of_slaves(state.contacts)
     for k, (label, pair) in enumerate(zip(labels(system), system.contacts, strict=True)):
         if not any(b is body for b in pair.bodies):
             continue
@@ -116,7 +115,7 @@ def at_nodes(
                 np.add.at(load, surface.rows, surface.owned(force))
         fields[f"contact_load_{label}"] = load
         if pair.slave.body is body:
-            own = state.contacts[k]
+            own = histories[k]
             first = np.where(own.force > 0.0, own.force, -own.gap)
             area = system.slave_area(k, state)
             press = own.force if loads is None else loads.pressing(k, own.force)

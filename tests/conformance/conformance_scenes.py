@@ -254,6 +254,26 @@ def in_a_bore(frame):
     return nts.System([block, own], contacts=pairs)
 
 
+def in_an_angle(frame):
+    """A cube slides along the inner edge of an angle, out of which one contact holds it."""
+    mesh = frame.grid("hexahedron", (0, 0, 0), (2, 1, 1), (2, 2, 1))
+    x = frame.back(mesh.geometry.x)
+    places = np.array([[(-1, -0.3), (-1, 0)], [(1.3, -0.3), (1, 0)], [(1.3, 1), (1, 1)]])
+    x[:, ::2] = places[np.rint(x[:, 0]).astype(int), np.rint(x[:, 2]).astype(int)]
+    mesh.geometry.x[:] = frame.place(x)
+    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    angle = nts.Continuum(mesh, law, density=DENSITY, name="angle")
+    cube = _solid(
+        frame, "tetrahedron", (0.6, 0.27, 0.003), (0.997, 0.68, 0.4), (2, 2, 2), "cube",
+        velocity=frame.place(1.1, 1.2, -0.9),
+    )  # fmt: skip
+    inside = angle.surface(
+        frame.where(lambda x: (np.abs(x[:, 2]) < 1e-6) | (np.abs(x[:, 0] - 1.0) < 1e-6))
+    )
+    own = cube.surface(frame.where(lambda x: (x[:, 2] < 0.0031) | (x[:, 0] > 0.9969)))
+    return nts.System([angle, cube], contacts=[nts.ContactPair(own, inside, friction=0.1)])
+
+
 def fold(frame):
     """A strip bent to a U, whose legs close and rub."""
     mesh = frame.grid("hexahedron", (0, 0, 0), (8, 0.3, 0.4), (8, 1, 2))
@@ -418,5 +438,5 @@ SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
     beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
     fold: 2e-3, hoist: 5e-3, of_degree_two: 2e-3, beam_on_a_plate: 1e-3, over_waves: 2e-3,
-    laws_in_joints: 1e-2, leaf_on_a_pad: 2e-3, tipping: 5e-3,
+    laws_in_joints: 1e-2, leaf_on_a_pad: 2e-3, tipping: 5e-3, in_an_angle: 2e-3,
 }  # fmt: skip

@@ -11,6 +11,7 @@ from conformance_scenes import (
     SCENES,
     beam_on_a_plate,
     fold,
+    in_an_angle,
     laws_in_joints,
     leaf_on_a_pad,
     mechanism,
@@ -49,7 +50,9 @@ OTHERS = [
     if name != "energy-momentum" and not (scene in (laws_in_joints, tipping) and rule.accelerations)
 ]  # fmt: skip
 #: Scenes of bodies that nothing holds or drives.
-FREE = (two_blocks, tied, fold, of_degree_two, beam_on_a_plate, over_waves, leaf_on_a_pad)
+FREE = (
+    two_blocks, tied, fold, of_degree_two, beam_on_a_plate, over_waves, leaf_on_a_pad, in_an_angle,
+)  # fmt: skip
 scenes = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
 
 
