@@ -220,13 +220,8 @@ class ContactElements(Batch):
         along = np.matmul(self.tangents, self.way_since(positions, path)[:, :, None])
         return nts_element.solve(metric, along)[:, :, 0]
 
-    def presses(self, own: Mapping[str, FloatArray]) -> BoolArray:
-        """Which slaves' multipliers press at an iterate, as of `evaluate`, shape (n,)."""
-        pressing: BoolArray = -self._multiplier(own)[:, 0] > self.law.no_force
-        return pressing
-
-    def _multiplier(self, own: Mapping[str, FloatArray]) -> FloatArray:
-        """h^2/2 lambda [kg m] of the slaves, shape (n, constraints)."""
+    def carries(self, own: Mapping[str, FloatArray]) -> FloatArray:
+        """Multipliers of the slaves [kg m] by own unknowns of `evaluate`, (n, constraints)."""
         return self.law.scale[:, None] * own["constraints"]
 
     def way_since(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
@@ -255,7 +250,7 @@ class ContactElements(Batch):
                 `ContactLaw.scale` [m], shape (n, constraints).
         """
         law, x = self.law, self._measured(x)
-        multiplier = self._multiplier(own)
+        multiplier = self.carries(own)
         try:
             found = self.measure.evaluate(x, own["augmented"], multiplier)
         except Exception:  # any of an obstacle of the user's; the other ranks wait

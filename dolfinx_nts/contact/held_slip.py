@@ -100,8 +100,9 @@ class HeldSlip:
     """What holds slaves of contacts over surfaces along these.
 
     A support does where it does not move against the master in the step; so does another contact
-    that was closed when the step began, where it presses in the iterate. What moves makes slip, and
-    friction is that of the motion. Of masters that are free to move nothing is known.
+    that was closed when the step began, where it presses in the iterate by more than friction does
+    against it. What moves makes slip, and friction is that of the motion. Of masters that are free
+    to move nothing is known.
 
     Args:
         pairs: Contacts of a system, and corners.
@@ -159,7 +160,13 @@ class HeldSlip:
         for i, holds in self._holds.items():
             total = np.zeros((len(elements[i].candidates.node), 2, 2))
             for by, here, there, along in holds:
-                on = slice(None) if by is None else elements[by].presses(own[by])[there]
+                on = np.ones(len(here), dtype=bool)
+                if by is not None:
+                    # What friction itself presses against a wall ends as soon as that holds.
+                    rubs = elements[i].carries(own[i])[here, 1:]
+                    pressed = -elements[by].carries(own[by])[there, 0]
+                    pressed -= np.einsum("na,na->n", rubs, along).clip(min=0.0)
+                    on = pressed > elements[by].law.no_force[there]
                 np.add.at(total, here[on], along[on, :, None] * along[on, None])
             if total.any():
                 own[i]["held"] = projector(total, LEAST_OWN)

@@ -199,7 +199,7 @@ class SurfaceElements(ContactElements):
         foot = np.einsum("nk,nki->ni", self.measure.foot, motion[:, 1:])
         return self.sums.to_slaves(motion[:, 0] - foot)
 
-    def _multiplier(self, own: Mapping[str, FloatArray]) -> FloatArray:
+    def carries(self, own: Mapping[str, FloatArray]) -> FloatArray:
         """Those of slaves, from the corners of elements."""
         width = self.law.num_constraints
         of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
@@ -216,7 +216,7 @@ class SurfaceElements(ContactElements):
         "held" in own projects on directions of their slips that they are held in, in their frames,
         shape (slaves, 2, 2); None are, if it is left out.
         """
-        multiplier = self._multiplier(own)
+        multiplier = self.carries(own)
         y = self._measured(x)
         try:
             points = self.measure.summed(y, self.sums, multiplier, self.frame)
