@@ -217,10 +217,14 @@ class ContactElements(Batch):
             path: Displacement of a master that is no body then [m], shape (3,).
         """
         metric = np.matmul(self.tangents, self.tangents.transpose(0, 2, 1))
-        along = np.matmul(self.tangents, self._way_from(positions, path)[:, :, None])
+        along = np.matmul(self.tangents, self.way_since(positions, path)[:, :, None])
         return nts_element.solve(metric, along)[:, :, 0]
 
-    def _way_from(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+    def carries(self, own: Mapping[str, FloatArray]) -> FloatArray:
+        """Multipliers of the slaves [kg m] by own unknowns of `evaluate`, (n, constraints)."""
+        return self.law.scale[:, None] * own["constraints"]
+
+    def way_since(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """How slaves have moved against their feet of t_n since then [m], shape (n, 3)."""
         way = self.measure.start - self.pair.points(positions, self.candidates) + path
         found: FloatArray = way[:, 0] - np.einsum("nk,nki->ni", self.measure.foot, way[:, 1:])
@@ -246,7 +250,7 @@ class ContactElements(Batch):
                 `ContactLaw.scale` [m], shape (n, constraints).
         """
         law, x = self.law, self._measured(x)
-        multiplier = law.scale[:, None] * own["constraints"]
+        multiplier = self.carries(own)
         try:
             found = self.measure.evaluate(x, own["augmented"], multiplier)
         except Exception:  # any of an obstacle of the user's; the other ranks wait

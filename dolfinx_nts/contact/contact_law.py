@@ -17,6 +17,7 @@ from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.contact.slip_friction import SlipFriction
 from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.kernels.vectors import projector
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Part of the slave's mass by which an open gap counts against a force. In each solution one of the
@@ -42,6 +43,8 @@ _STILL = 1e-10
 #: Stiffness against sliding of pairs that hardly rub, over that of the nodes: next to nothing, but
 #: the equations of a body that friction alone holds have a solution.
 HARDLY = 1e-9
+#: Square of the part of a direction that is none of its own beside another one.
+LEAST_OWN = 1e-2
 #: Largest ratio of normal forces by which friction of a rigid body's nodes is divided.
 UNEVEN = 100.0
 
@@ -344,8 +347,9 @@ class ContactLaw(Batch):
         return law.structure()
 
     def obey(
-        self, x: FloatArray, found: Measured, multiplier: FloatArray, together: Together
-    ) -> compiled_law.Obeyed:
+        self, x: FloatArray, found: Measured, multiplier: FloatArray, together: Together,
+        beside: FloatArray | None = None,
+    ) -> compiled_law.Obeyed:  # fmt: skip
         """Semi-smooth laws of contact (theory section 9) and friction (section 6).
 
         g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0. These are
@@ -357,12 +361,20 @@ class ContactLaw(Batch):
             found: What they measure; its rows may be overwritten.
             multiplier: h^2/2 lambda of the constraints [kg m], shape (n, constraints).
             together: What pairs that share nodes know of each other.
+            beside: Projector on the part of lambda_T that something else bears in the iterate,
+                shape (n, 2, 2): it is zero, and the slip has none there. None: there is none.
         """
-        held, prescribed = None, self.prescribed
+        held, prescribed, law = None, self.prescribed, self._at(found.slip, multiplier)
         if prescribed and prescribed.any:
             held = prescribed.held(x, self.still, self.slid)
+        if beside is not None:
+            unmoved, held = (
+                beside if own is None else projector(own + beside, LEAST_OWN)
+                for own in (self._law.unmoved, held)
+            )
+            law = self._law._replace(unmoved=unmoved).structure()
         return compiled_law.laws(
-            self._at(found.slip, multiplier), together, found.residual, found.tangent, found.gap,
+            law, together, found.residual, found.tangent, found.gap,
             found.slip, multiplier, held, found.normal, found.let_go,
         )  # fmt: skip
 

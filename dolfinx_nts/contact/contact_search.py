@@ -18,6 +18,7 @@ from dolfinx_nts.contact.apart import Apart
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
+from dolfinx_nts.contact.held_slip import HeldSlip
 from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.placed import Placed
@@ -51,6 +52,7 @@ class ContactSearch:
         elements: Candidates of each of these that have unknowns in this step.
         idle: The others, which the step's motion does not bring to their masters.
         idle_gaps: Gaps [m] of the idle candidates of each in the last solution.
+        held: What else holds slaves in this step.
         edges: Those of contacts whose surfaces are near each other in this step, by their number.
     """
 
@@ -65,7 +67,7 @@ class ContactSearch:
         self._declared = sum(pair.of is None for pair in contacts)
         self._places, self._edges = Placed(contacts, bodies), edges
         self.edges: dict[int, EdgeCoupling] = {}
-        self._apart = Apart(contacts, bodies)
+        self._apart, self.held = Apart(contacts, bodies), HeldSlip(contacts, self._places)
         self._sought: list[int] = []
         self._cover, self._repeats = [0.0] * len(contacts), 0
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
@@ -154,6 +156,7 @@ class ContactSearch:
         both = list(zip(self._found, self._with_unknowns, strict=True))
         self.elements, self.idle = [c.select(a) for c, a in both], [c.select(~a) for c, a in both]
         self.idle_gaps = [np.empty(0) for _ in self.idle]
+        self.held.begin(self._step, self._begun or self._step.state, self.numbers, self.elements)
 
     def watch(self) -> Asking[None]:
         """Note whether any rank has idle candidates, after `begin` and `wake`, as of `together`."""
@@ -248,9 +251,8 @@ class ContactSearch:
         if pair.friction and not step.dt:
             # A load step is relaxed in several solutions, and friction knows of all of them.
             begun = self._begun or step.state
-            since = pair.positions([begun.u[b] for b in bodies])
-            slid = elements.slid_since(since, pair.path(begun.time, begun.time)[0])
-            law = replace(law, slid=slid)
+            since, start = pair.positions([begun.u[b] for b in bodies]), begun.time
+            law = replace(law, slid=elements.slid_since(since, pair.path(start, start)[0]))
         massless = self._massless[k][found.node]
         if step.integrator.inertia and massless.any():
             before = step.factor * elements.carried(old)
@@ -284,9 +286,8 @@ class ContactSearch:
         if not self._watching:
             return False
         self.idle_gaps = self._gaps(self.idle, [terms.u1 for terms in e.bodies])
-        closed = [
-            ~(gap >= -c.law.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
-        ]
+        both = zip(self.idle, self.idle_gaps, strict=True)
+        closed = [~(gap >= -c.law.gap_rounding) for c, gap in both]
         if not anywhere(self._comm, any(c.any() for c in closed)):
             return False
         for awake, late in zip(self._with_unknowns, closed, strict=True):
@@ -362,9 +363,8 @@ class ContactSearch:
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""
         histories = self._apart.histories(self._old, self._followed)
-        for k, c, part, idle, gaps in zip(
-            self.numbers, self.elements, parts, self.idle, self.idle_gaps, strict=True
-        ):
+        each = zip(self.numbers, self.elements, parts, self.idle, self.idle_gaps, strict=True)
+        for k, c, part, idle, gaps in each:
             new, others = c.history(part, self._step.factor, self._old[k]), idle.candidates
             new.facet[others.node], new.gap[others.node] = others.facet, gaps
             histories[k] = new._replace(followed=self._followed[k])

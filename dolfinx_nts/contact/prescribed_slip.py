@@ -9,6 +9,7 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch
 from dolfinx_nts.kernels import nts_element
+from dolfinx_nts.kernels.vectors import projector
 from dolfinx_nts.types import BoolArray, FloatArray
 
 #: Square of the part of a motion that counts as none.
@@ -49,9 +50,7 @@ class PrescribedSlip(Batch):
         slip there is prescribed.
         """
         along = np.eye(3) - self.normal[:, :, None] * self.normal[:, None]
-        part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
-        vector *= (part > _IMMOVABLE)[:, None]
-        return np.matmul(vector, vector.transpose(0, 2, 1))
+        return projector(np.matmul(along * self._prescribed[:, None], along), _IMMOVABLE)
 
     @cached_property
     def unmoved(self) -> FloatArray:

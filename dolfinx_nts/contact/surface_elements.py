@@ -189,7 +189,7 @@ class SurfaceElements(ContactElements):
         carries = np.append(part.active, False)[self.sums.slot].any(axis=1)
         return anywhere(self.pair.slave.body.comm, bool(strayed[carries].any()))
 
-    def _way_from(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+    def way_since(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """As of `ContactElements`, in the mean."""
         way = self.measure.start - self._placed(positions) + path
         return self._along_feet(way)
@@ -199,29 +199,38 @@ class SurfaceElements(ContactElements):
         foot = np.einsum("nk,nki->ni", self.measure.foot, motion[:, 1:])
         return self.sums.to_slaves(motion[:, 0] - foot)
 
+    def carries(self, own: Mapping[str, FloatArray]) -> FloatArray:
+        """Those of slaves, from the corners of elements."""
+        width = self.law.num_constraints
+        of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
+        return self.law.scale[:, None] * of_corners[self._first]
+
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """No augmented unknowns: those of points follow from their places."""
         return np.empty((self.num_elements, 0))
 
     # ---- an iterate
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Asking[Contribution]:
-        """As of `ContactElements`, by multipliers of the slaves at the corners."""
-        width = self.law.num_constraints
-        of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
-        multiplier = self.law.scale[:, None] * of_corners[self._first]
+        """As of `ContactElements`, by multipliers of the slaves at the corners.
+
+        "held" in own projects on directions of their slips that they are held in, in their frames,
+        shape (slaves, 2, 2); None are, if it is left out.
+        """
+        multiplier = self.carries(own)
         y = self._measured(x)
         try:
             points = self.measure.summed(y, self.sums, multiplier, self.frame)
         except Exception:  # as of `ContactElements`
             yield from self._together(np.empty(0), None, np.empty((0, 1)))
             raise
-        found = self._of_slaves(points, y, multiplier)
+        held = own.get("held")
+        found = self._of_slaves(points, y, multiplier, held)
         together = yield from self._together(found.gap, found.slip, multiplier)
         # What moves as prescribed is asked for with friction alone.
         motion = np.empty((len(multiplier), 1, 3))
         if self.law.prescribed:
             motion = self._along_feet(y - self.measure.start)[:, None]
-        obeyed = self.law.obey(motion, found, multiplier, together)
+        obeyed = self.law.obey(motion, found, multiplier, together, held)
         residual, tangent = points.residual, points.tangent
         if self.attachment.weights is not None:
             residual, tangent = compiled_law.to_nodes(self.attachment.weights, residual, tangent)
@@ -236,8 +245,9 @@ class SurfaceElements(ContactElements):
         )
 
     def _of_slaves(
-        self, points: compiled.OverSurface, y: FloatArray, multiplier: FloatArray
-    ) -> Measured:
+        self, points: compiled.OverSurface, y: FloatArray, multiplier: FloatArray,
+        held: FloatArray | None,
+    ) -> Measured:  # fmt: skip
         """What the law takes for elements, whose coordinates are gap and slip of the slaves.
 
         Their rows of coordinates are minus the forces on the slaves.
@@ -254,6 +264,9 @@ class SurfaceElements(ContactElements):
         gradient[:, [0, 1], [1, 2]] = 1.0
         metric = np.tile(np.eye(2), (n, 1, 1))
         value = np.einsum("nki,ni->nk", self.frame, points.slip) + self.law.slid
+        if held is not None:
+            value -= np.einsum("nkl,nl->nk", held, value)
+            gradient[:, :, 1:3] -= held
         slip = Slip(value, gradient, metric, np.zeros((n, 2, 2, 3 + width)))
         normal = self.sums.to_slaves(self.measure.normal_between(y))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

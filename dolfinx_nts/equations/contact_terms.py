@@ -73,13 +73,16 @@ class ContactTerms:
         self.destroy()
         u, system = self.state.u, self._system
         size = np.array([np.abs(a).max(initial=0.0) for a in u])
+        first = [a.copy() for a in u]
+        for body, there in zip(system.bodies, first, strict=True):
+            there[body.fixed] = body.prescribed(time)
         step = Step(
             state=self.state,
             dt=time - self.state.time,
             factor=1.0,
             integrator=EQUILIBRIUM,
             condense=True,
-            first=u,
+            first=first,
             ahead=[np.zeros_like(a) for a in u],
             motion=np.full(len(u), float(reach)),
             length=global_max(system.comm, size),
@@ -206,5 +209,6 @@ class ContactTerms:
         """Contribution of the elements at an iterate. Collective."""
         laid, elements = self._layout, self._search.elements
         own = laid.own_values(x.array_r, elements)
+        self._search.held.tell(elements, own)
         places = laid.positions(x, elements)
         return evaluate_together(self._system.comm, elements, places, own)

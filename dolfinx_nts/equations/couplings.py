@@ -182,12 +182,15 @@ class Couplings:
     def tell_loads(
         self, own: Sequence[dict[str, FloatArray]], loads: Mapping[int, Load]
     ) -> None:
-        """Add to the unknowns of laws what the forces are that they lean on, see `Load.told`.
+        """Add to the unknowns of laws what others of the iterate are that they lean on.
+
+        Of joints it is forces, see `Load.told`, of contacts what holds their slaves.
 
         Args:
             own: Of each of `elements` its own unknowns, see `Unknowns.own_values`.
             loads: `loads` of these elements.
         """
+        self.contacts.held.tell(self.contacts.elements, own)
         elements = self.elements if loads else []
         for i, load in loads.items():
             own[i].update(load.told(elements, own))

@@ -19,6 +19,14 @@ def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
     return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
 
 
+def projector(squares: FloatArray, least: float) -> FloatArray:
+    """Projectors on the directions whose squares sum up to matrices (n, k, k), in which is more."""
+    part, vector = np.linalg.eigh(squares)
+    vector *= (part > least)[:, None]
+    found: FloatArray = np.matmul(vector, vector.transpose(0, 2, 1))
+    return found
+
+
 def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:
     """Largest components of vectors along the axes and against them, shape (2, 3).
 

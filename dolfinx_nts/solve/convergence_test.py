@@ -118,7 +118,9 @@ class ConvergenceTest:
         late = iteration > 0 and iteration % _INSIDE_OUT == 0
         in_vain = self._iterates.runs_away or self._upright.gives_up
         # In statics what slides first hardly ever fails.
-        in_vain |= not self.patient and iteration >= _CYCLING and self._iterates.cycles
+        # What has settled late converges.
+        impatient = changed and not self.patient and iteration >= _CYCLING
+        in_vain |= impatient and self._iterates.cycles
         if in_vain or (late and self._is_inside_out(last)):
             return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= allowed:

@@ -180,8 +180,9 @@ def test_tangent_is_the_derivative_of_the_residual(shape, sliding):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("integration", ["nodes", "surface"])
 @pytest.mark.parametrize("drag", [1e-6, 1e-3, 1.0])
-def test_nodes_that_are_made_to_slip_feel_friction_however_slow(drag):
+def test_nodes_that_are_made_to_slip_feel_friction_however_slow(drag, integration):
     """Prescribed motion along the floor: its supports carry mu times the pressure."""
     kind, ghost = CellType.hexahedron, GhostMode.shared_facet
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, 0.5]], [2, 2, 1], kind, ghost_mode=ghost)
@@ -196,7 +197,7 @@ def test_nodes_that_are_made_to_slip_feel_friction_however_slow(drag):
     block = nts.Continuum(mesh, RUBBER, density=1e3, bcs=[faces, top], name="block")
     face = block.surface(lambda x: x[2] < 1e-9)
     floor = nts.Plane((0, 0, 0), (0, 0, 1), name="floor")
-    pair = nts.ContactPair(face, floor, friction=0.3)
+    pair = nts.ContactPair(face, floor, friction=0.3, integration=integration)
     run = nts.equilibrium(nts.System([block], contacts=[pair]), load_steps=3)
     assert run.status == "completed"
     force, support = run.contact_forces[1:, 0], run.reactions["block"][1:].sum(axis=1)
