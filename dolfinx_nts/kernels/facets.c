@@ -1,7 +1,7 @@
 /* Projections onto facets and closest points of them.
 
    `project` leaves to kernels/facets.py, and `closest_facets` to contact/search.py, what they do not do.
-   tests/kernels/test_compiled.py compares both with these and with tests/twins. */
+   tests/kernels/test_compiled.py compares the first with that. */
 
 #include <float.h>
 #include <stdlib.h>

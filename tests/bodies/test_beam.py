@@ -1,7 +1,5 @@
 """Beams: theory sections 15, 20; benchmarks B26, B27, B29, B41."""
 
-import logging
-
 from mpi4py import MPI
 
 import numpy as np
@@ -202,12 +200,6 @@ def flying(scale, comm):
     )
 
 
-def fly(rule, dt, t_end, scale=1.0, comm=MPI.COMM_WORLD):
-    beam = flying(scale, comm)
-    run = nts.simulate(nts.System([beam]), rule, dt=dt, t_end=t_end)
-    return run, beam.centreline()[1]
-
-
 def off(run):
     """Errors of E and J over their size."""
     energy, spin = run.balance["energy"], run.balance["angular_momentum"]
@@ -215,26 +207,6 @@ def off(run):
         np.abs(energy / energy[0] - 1).max(),
         np.abs(spin - spin[0]).max() / np.linalg.norm(spin[0]),
     )
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize(("dt", "t_end"), [(0.05, 5), (0.2, 20), (0.5, 20)])
-@pytest.mark.fast("0.2-20")
-@pytest.mark.fast_on_ranks()
-def test_a_flying_beam_keeps_energy_and_angular_momentum(dt, t_end):
-    run, _ = fly(EM, dt, t_end)
-    assert run.status == "completed" and run.retries == 0
-    assert max(off(run)) < 1e-12
-
-
-@pytest.mark.slow
-def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
-    with caplog.at_level(logging.ERROR):
-        run, _ = fly(MID, 0.05, 20)
-        coarse, _ = fly(MID, 0.2, 20)
-    energy, spin = off(run)
-    assert energy > 1e-3 and spin < 1e-12
-    assert off(coarse)[0] > 0.05 and "does not keep it" in coarse.status
 
 
 @pytest.mark.mpi
@@ -372,29 +344,6 @@ def test_a_root_held_by_a_joint_is_clamped():
     held = nts.Fixed(beam, None, point=(0, 0, 0))
     nts.equilibrium(nts.System([beam], joints=[held]), load_steps=5)
     assert beam.centreline()[1][-1] == pytest.approx((*TIPS[8], 0.0), abs=1e-8)
-
-
-@pytest.mark.mpi
-def test_a_corner_of_two_beams_and_a_rigid_body_fly_on():
-    """Fixed at right angles, and a hinge: energy and angular momentum are kept."""
-    section = nts.Section(EA=1e4, GA=(1e4,) * 2, GJ=500, EI=(500,) * 2, rhoA=1, rhoI=(0.1, 0.1))
-    spin, end = (0.3, 0.5, 1), np.array([2.0, 0, 0])
-    one = nts.Beam(interval_mesh(straight(4, 2)), section, name="one", angular_velocity=spin,
-                   velocity=np.cross(spin, (1, 0, 0)))  # fmt: skip
-    two = nts.Beam(interval_mesh(end + straight(4, 2, (0, 1, 0))), section, name="two",
-                   angular_velocity=spin, velocity=np.cross(spin, (2, 1, 0)))  # fmt: skip
-    ball = nts.RigidBody.from_inertia(
-        2.0, (0.3, 0.4, 0.5), centre=(2, 3, 0), angular_velocity=spin,
-        velocity=np.cross(spin, (2, 3, 0)), name="ball",
-    )  # fmt: skip
-    joints = [
-        nts.Fixed(one, two, point=end),
-        nts.Revolute(two, ball, point=(2, 2, 0), axis=(0, 0, 1)),
-    ]
-    run = nts.simulate(nts.System([one, two, ball], joints=joints), EM, dt=0.1, t_end=2)
-    assert run.status == "completed" and max(off(run)) < 1e-12
-    (_, a), (_, b) = one.centreline(), two.centreline()
-    assert a[-1] == pytest.approx(b[0], abs=1e-10)
 
 
 def test_a_joint_between_nodes_is_told():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cells import COMM, DEFLECTION, bar, between, differences, distorted, largest, own_energy
+from cells import DEFLECTION, bar, between, differences, distorted, own_energy
 from integrators import MID_STEP
 from rotations import rotation
 from scenes import box
@@ -32,12 +32,6 @@ def test_bars_bend_as_in_another_program(cells, poisson, share):
     """Theory 19.5, per cent of the reference; without modes 88, 80, 65, 20, 18 and 1."""
     found = bar(cells, poisson, bending=True) / DEFLECTION[poisson]
     assert 100.0 * found == pytest.approx(share, abs=0.1)
-
-
-@pytest.mark.parametrize("metre", [1e-3, 1e3])
-def test_units_of_a_bar(metre):
-    found, expected = (bar((10, 1, 1), 0.3, m, bending=True) for m in (metre, 1.0))
-    assert found == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_strip():
@@ -136,80 +130,6 @@ def spinning(**options):
 
     mesh = box((0.0, 0.0, 0.0), (2.0, 0.4, 0.2), (6, 2, 1))
     return nts.System([body_of(mesh, nts.NeoHookean(1e5, 0.3), velocity=thrown, **options)])
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("integrator", MID_STEP)
-def test_a_spinning_bar_keeps_what_it_should(integrator):
-    balance = nts.simulate(spinning(), MID_STEP[integrator], dt=2e-3, t_end=0.04).balance
-    assert balance["potential"].max() > 0.01 * balance["kinetic"][0]
-    for name in ("linear_momentum", "angular_momentum"):
-        moved = np.abs(balance[name] - balance[name][0]).max()
-        assert moved < 1e-12 * np.abs(balance[name][0]).max()
-    if integrator == "energy-momentum":
-        moved = np.abs(balance["energy"] - balance["energy"][0]).max()
-        assert moved < 1e-12 * balance["energy"][0]
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("rule", [nts.Newmark(), nts.GeneralizedAlpha()])
-@pytest.mark.fast_on_ranks()
-def test_other_integrators(rule):
-    """The path of the energy-momentum scheme up to the square of the step."""
-    ends = []
-    for integrator in (rule, nts.EnergyMomentum()):
-        run = nts.simulate(spinning(), integrator, dt=5e-4, t_end=0.02)
-        ends.append(run.state.u[0])
-    assert largest(ends[0] - ends[1]) < 0.02 * largest(ends[1])
-
-
-def test_order_two():
-    ends = []
-    for dt in (2e-3, 1e-3, 5e-4, 1.25e-4):
-        ends.append(nts.simulate(spinning(), nts.EnergyMomentum(), dt=dt, t_end=0.02).state.u[0])
-    errors = [largest(u - ends[-1]) for u in ends[:-1]]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.25)
-    assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.25)
-
-
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_contact_with_friction_closes_the_ledger():
-    a = body_of(box((0, 0, 0), (1.0, 1.0, 0.3), (3, 3, 1)), name="a", velocity=(0.5, 0.0, -3.0))
-    ends = ((-0.1, -0.1, -0.304), (1.1, 1.1, -0.004))
-    b = body_of(box(*ends, (4, 4, 1)), name="b")
-    contact = nts.ContactPair(
-        a.surface(lambda x: x[2] < 1e-9), b.surface(lambda x: x[2] > -0.004 - 1e-9), friction=0.3
-    )
-    run = nts.simulate(
-        nts.System([a, b], contacts=[contact]), nts.EnergyMomentum(), dt=5e-4, t_end=0.01
-    )
-    balance = run.balance
-    assert run.status == "completed"
-    assert balance["active"].max() > 4 and balance["friction_dissipation"][-1] > 0.0
-    assert np.abs(balance["ledger_residual"]).max() < 1e-11 * balance["energy"][0]
-    for name in ("linear_momentum", "angular_momentum"):
-        moved = np.abs(balance[name] - balance[name][0]).max()
-        assert moved < 1e-12 * np.abs(balance[name][0]).max()
-
-
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_a_restart_goes_on_from_the_modes(tmp_path_factory):
-    """As if never stopped: the modes of t_n belong to the state."""
-    folder = str(tmp_path_factory.mktemp("modes")) if COMM.rank == 0 else None
-    name = f"{COMM.bcast(folder)}/state.h5"
-    whole = nts.simulate(spinning(), nts.EnergyMomentum(), dt=2e-3, t_end=0.04)
-    nts.simulate(
-        spinning(), nts.EnergyMomentum(), dt=2e-3, t_end=0.02,
-        checkpoint=nts.Checkpoint(name, every=10),
-    )  # fmt: skip
-    system = spinning()
-    run = nts.simulate(
-        system, nts.EnergyMomentum(), dt=2e-3, t_end=0.04, start=nts.restart(name, system)
-    )
-    assert largest(run.state.u[0] - whole.state.u[0]) < 1e-12 * largest(whole.state.u[0])
-    assert run.balance["energy"][-1] == pytest.approx(whole.balance["energy"][-1], rel=1e-12)
 
 
 @pytest.mark.mpi

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import meshtags
-from scenes import RUBBER, everywhere
+from scenes import RUBBER
 from xdmf import read_xdmf
 
 import dolfinx_nts as nts
@@ -138,18 +138,3 @@ def test_folded_cells(part):
     mesh.geometry.x[kept] = places
     with pytest.raises(ValueError, match="curved cells are folded"):
         nts.Continuum(mesh, RUBBER, density=1.0)
-
-
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_a_body_that_flies_keeps_what_it_has(part):
-    """Energy and momenta of a curved body that spins."""
-    body = part.continuum(
-        RUBBER, density=1e3, velocity=lambda x: np.stack([-3 * x[1], 3 * x[0], 0 * x[0] + 1])
-    )
-    assert len(body.surface(everywhere).facets)
-    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=5e-3, t_end=0.025)
-    table = run.balance
-    assert np.abs(table["energy"] / table["energy"][0] - 1).max() < 1e-12
-    moment = table["angular_momentum"]
-    assert np.abs(moment - moment[0]).max() < 1e-12 * np.abs(moment).max()

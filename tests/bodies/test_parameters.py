@@ -81,13 +81,6 @@ def test_halves_of_two_stiffnesses_and_densities():
     np.testing.assert_allclose(motion.centre, 1.1 * np.array([0.5, 0.5, (0.25 + 3.75) / 6]))
 
 
-def test_a_rigid_body_of_two_densities():
-    mesh = box(cells=(2, 2, 2))
-    body = nts.RigidBody(mesh, density=field(mesh, 1e3, 5e3))
-    np.testing.assert_allclose(body.mass, 3e3, rtol=1e-13)
-    np.testing.assert_allclose(body.centre, [0.5, 0.5, (0.25 + 3.75) / 6], rtol=1e-13)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_rigid_body_whose_density_changes_ends_the_run(kind):
     mesh = box(cells=(2, 2, 2))
@@ -102,36 +95,6 @@ def test_a_rigid_body_whose_density_changes_ends_the_run(kind):
         nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=4 * DT, before_step=change
     )
     assert run.status.startswith("density of 'lid': has changed") and len(run.rows) == 3
-
-
-def test_a_changed_density_of_a_rigid_body_is_refused_in_every_step():
-    density = fem.Constant(mesh := box(cells=(1, 1, 1)), 1e3)
-    stepper = nts.Stepper(nts.System([nts.RigidBody(mesh, density=density)]), nts.Midpoint())
-    stepper.advance(DT)
-    density.value = 2e3
-    for _ in range(2):
-        with pytest.raises(nts.UserFunctionError, match="^density of 'rigid': has changed"):
-            stepper.advance(DT)
-    stepper.close()
-
-
-def test_a_density_that_is_doubled_is_told_with_its_momentum():
-    """Velocities stay, so that energy and momenta of the flight are twice what they were."""
-    mesh = box(cells=(1, 1, 1))
-    density = fem.Constant(mesh, DENSITY)
-    body = nts.Continuum(
-        mesh, nts.NeoHookean(YOUNG, POISSON), density=density, velocity=(3.0, 0.0, 4.0)
-    )
-
-    def change(time, dt):
-        density.value = DENSITY if time < DT else 2 * DENSITY
-
-    run = nts.simulate(
-        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=change
-    )
-    text = run.warnings["material changed"].text
-    assert "adds 1.25e+04 to" in text and "5e+03 of linear and 2.55e+03 of angular" in text
-    assert np.allclose(run.balance["linear_momentum"][-1], [6e3, 0, 8e3], rtol=1e-12)
 
 
 @pytest.mark.fast("constant")
@@ -159,8 +122,11 @@ def test_a_modulus_changed_between_steps(kind):
 
 
 @pytest.mark.fast("constant-integrator0")
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint(), nts.Newmark()])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "integrator"),
+    [("constant", nts.EnergyMomentum()), (list(KINDS)[1], nts.Midpoint()),
+     (list(KINDS)[1], nts.Newmark())],
+)  # fmt: skip
 @pytest.mark.fast_on_ranks()
 def test_a_density_changed_between_steps(kind, integrator):
     """Mass that comes has the velocity of its place: energy and momentum grow with it."""
@@ -185,19 +151,6 @@ def test_a_density_changed_between_steps(kind, integrator):
     kinetic = 0.5 * DENSITY * (9.0 + (10 * DT) ** 2)
     np.testing.assert_allclose(table["material_change"][1:], [0.0, kinetic], rtol=1e-11)
     assert np.abs(table["ledger_residual"]).max() < 1e-10 * kinetic
-
-
-def test_a_density_changed_before_the_run():
-    mesh = box(cells=(2, 2, 2))
-    density = fem.Constant(mesh, DENSITY)
-    body = nts.Continuum(
-        mesh, nts.NeoHookean(YOUNG, POISSON), density=density, velocity=(3.0, 0.0, 0.0)
-    )
-    density.value = 3 * DENSITY
-    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=DT)
-    np.testing.assert_allclose(run.balance["linear_momentum"][:, 0], 9e3, rtol=1e-12)
-    assert not run.balance["material_change"].any()
-    assert run.status == "completed"
 
 
 def test_a_mass_of_forms_changed_between_steps():
@@ -255,16 +208,6 @@ def test_a_value_out_of_range_in_one_cell_ends_the_run(name, good, bad):
     )
     assert f"a parameter of 'cube' has changed: {name} with a value of {bad}: must" in run.status
     assert len(run.balance["time"]) == 2
-
-
-def test_the_stiffness_of_nodes_is_that_of_changed_moduli():
-    mesh = box(cells=(1, 1, 1))
-    body = nts.Continuum(mesh, nts.NeoHookean(YOUNG, POISSON), density=DENSITY)
-    before = body.nodal_stiffness()
-    (moduli,) = (t for t in body._parameters.all if t.ufl_shape == (2,))
-    moduli.value = 3 * moduli.value
-    body.take_parameters()
-    np.testing.assert_allclose(body.nodal_stiffness(), 3 * before, rtol=1e-13)
 
 
 def test_what_is_no_parameter_is_refused():

@@ -42,13 +42,6 @@ def test_bars_bend_as_in_another_program(cells, poisson, share):
     assert 100.0 * found == pytest.approx(share, abs=0.1)
 
 
-@pytest.mark.parametrize("metre", [1e-3, 1e3])
-@pytest.mark.fast("1000.0")
-def test_units_of_a_bar(metre):
-    found, expected = (bar((10, 1, 1), 0.4999, m, volume="projected") for m in (metre, 1.0))
-    assert found == pytest.approx(expected, rel=1e-9)
-
-
 @pytest.mark.slow
 def test_cook_s_membrane():
     """Deflection of the middle of the loaded side in plane strain: 16.4326 (Krysl, FinEALE).
@@ -170,50 +163,6 @@ def test_stress_balances_a_load():
     local = np.array([stress.sum(), len(stress)])
     total, count = COMM.allreduce(local)
     assert total / count == pytest.approx(-1e2, rel=1e-3)
-
-
-# ---- motion
-@pytest.mark.mpi
-@pytest.mark.parametrize("integrator", MID_STEP)
-def test_a_spinning_bar_keeps_what_it_should(integrator):
-    """Nearly incompressible, bent at the start, as fast as its waves; 20 steps."""
-
-    def thrown(x):
-        return np.array([0.3 * x[2], 4.0 * (x[0] - 1.0), 2.0 * np.cos(x[0])])
-
-    mesh = box((0.0, 0.0, 0.0), (2.0, 0.4, 0.4), (5, 2, 2))
-    body = body_of(mesh, nts.NeoHookean(young=1e5, poisson=0.49), velocity=thrown)
-    run = nts.simulate(nts.System([body]), MID_STEP[integrator], dt=2e-3, t_end=0.04)
-    balance = run.balance
-    assert run.status.startswith("completed")
-    assert balance["potential"].max() > 0.01 * balance["kinetic"][0]
-    for name in ("linear_momentum", "angular_momentum"):
-        moved = np.abs(balance[name] - balance[name][0]).max()
-        assert moved < 1e-12 * np.abs(balance[name][0]).max()
-    if integrator == "energy-momentum":
-        moved = np.abs(balance["energy"] - balance["energy"][0]).max()
-        assert moved < 1e-12 * balance["energy"][0]
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
-def test_contact_with_friction_closes_the_ledger():
-    a = body_of(box(cells=(3, 3, 3)), name="a", velocity=(3.0, 0.5, 0.0))
-    ends = ((1.004, -0.1, -0.1), (2.004, 1.1, 1.1))
-    b = body_of(box(*ends, (2, 4, 4)), name="b")
-    contact = nts.ContactPair(
-        a.surface(lambda x: x[0] > 1 - 1e-9), b.surface(lambda x: x[0] < 1.004 + 1e-9),
-        friction=0.3,
-    )  # fmt: skip
-    run = nts.simulate(nts.System([a, b], contacts=[contact]), nts.EnergyMomentum(),
-                       dt=1e-3, t_end=0.02)  # fmt: skip
-    balance = run.balance
-    assert balance["active"].max() > 4 and balance["friction_dissipation"][-1] > 0.0
-    start = balance["energy"][0]
-    assert np.abs(balance["ledger_residual"]).max() < 1e-11 * start
-    for name in ("linear_momentum", "angular_momentum"):
-        moved = np.abs(balance[name] - balance[name][0]).max()
-        assert moved < 1e-12 * np.abs(balance[name][0]).max()
 
 
 # ---- parameters and refusals

@@ -1,7 +1,5 @@
 """Shells: theory section 15; benchmarks B28, B30."""
 
-import logging
-
 from mpi4py import MPI
 
 import numpy as np
@@ -347,30 +345,6 @@ def off(run):
         np.abs(energy / energy[0] - 1).max(),
         np.abs(spin - spin[0]).max() / np.linalg.norm(spin[0]),
     )
-
-
-TIMES = [(0.01, 0.1), (0.1, 0.5), (0.1, 5)]
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize(("dt", "t_end"), TIMES)
-@pytest.mark.fast("0.01-0.1", "0.1-0.5")
-@pytest.mark.fast_on_ranks("0.1-0.5")
-def test_a_flying_plate_keeps_energy_and_angular_momentum(dt, t_end):
-    run, _ = fly(EM, dt, t_end)
-    assert run.status == "completed" and run.retries == 0
-    assert max(off(run)) < 1e-12
-
-
-@pytest.mark.slow
-def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
-    """It loses the energy or its solution; without cuts of the step it stops at h = 0.1."""
-    with caplog.at_level(logging.ERROR):
-        run, _ = fly(MID, 0.05, 2)
-        coarse, _ = fly(MID, 0.1, 5, nts.Newton(max_retries=0))
-    energy, spin = off(run)
-    assert energy > 0.03 and spin < 1e-11 and "energy has changed" in run.status
-    assert not coarse.status.startswith("completed") and len(coarse.balance["time"]) < 20
 
 
 @pytest.mark.mpi

@@ -105,12 +105,6 @@ def test_a_users_energy():
     assert np.allclose(nts.von_mises(body).x.array, equivalent(exact), rtol=1e-12)
 
 
-def test_a_rotation_is_free_of_stress():
-    body = homogeneous(RUBBER, 1, gradient=TURN)
-    assert np.all(nts.von_mises(body).x.array < 1e-8)
-    assert np.abs(of_cells(nts.cauchy_stress(body, at="cells"))).max(initial=0.0) < 1e-8
-
-
 def test_stress_turns_with_the_body():
     still, turned = homogeneous(RUBBER, 1), homogeneous(RUBBER, 1, gradient=TURN @ SHEAR)
     expected = TURN @ of_cells(nts.cauchy_stress(still, at="cells")) @ TURN.T

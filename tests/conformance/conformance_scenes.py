@@ -5,6 +5,7 @@ A new body, coupling or law needs a scene here: what holds for all is then held 
 
 import numpy as np
 from dolfinx import fem
+from rotations import rotation
 from scenes import green, saint_venant
 
 import dolfinx_nts as nts
@@ -27,8 +28,8 @@ def _rigid(frame, low, high, name, spin=(0, 0, 0), velocity=(0, 0, 0), cells=(2,
     )  # fmt: skip
 
 
-def _face(frame, body, axis, value):
-    return body.surface(frame.where(lambda x: np.abs(x[:, axis] - value) < 1e-6))
+def _face(frame, body, axis, value, **options):
+    return body.surface(frame.where(lambda x: np.abs(x[:, axis] - value) < 1e-6), **options)
 
 
 def _plane(frame, height=0.0):
@@ -46,19 +47,19 @@ def two_blocks(frame):
         frame, "hexahedron", (0.21, 0.17, 0.602), (0.83, 0.77, 1.2), (2, 2, 2), "upper",
         velocity=frame.place(0.4, 0.1, -0.9),
     )  # fmt: skip
-    pair = nts.ContactPair(
-        _face(frame, upper, 2, 0.602), _face(frame, lower, 2, 0.6), friction=0.3
-    )
+    pair = nts.ContactPair(_face(frame, upper, 2, 0.602), _face(frame, lower, 2, 0.6), friction=0.3)
     return nts.System([lower, upper], contacts=[pair])
 
 
 def block_on_a_plane(frame):
-    """St. Venant-Kirchhoff's law; slides and settles."""
+    """St. Venant-Kirchhoff's law, on nodes without mass; slides and settles."""
     block = _solid(
-        frame, "hexahedron", (0, 0, 0), (1, 0.5, 0.4), (3, 2, 2), "block",
+        frame, "hexahedron", (0, 0, 0), (1, 0.5, 0.4), (3, 2, 5), "block",
         nts.StVenantKirchhoff, velocity=frame.place(1.0, 0.2, 0),
     )  # fmt: skip
-    pair = nts.ContactPair(_face(frame, block, 2, 0.0), _plane(frame), friction=0.2)
+    pair = nts.ContactPair(
+        _face(frame, block, 2, 0.0, mass="redistributed"), _plane(frame), friction=0.2
+    )
     return nts.System([block], contacts=[pair], gravity=_gravity(frame))
 
 
@@ -123,8 +124,9 @@ def tied(frame):
         return np.transpose([frame.place(*v) for v in np.cross(spin, frame.back(x.T))])
 
     rod = _solid(
-        frame, "hexahedron", (0, 0, 0), (1.2, 0.3, 0.3), (4, 1, 1), "rod", velocity=turning
-    )
+        frame, "hexahedron", (0, 0, 0), (1.2, 0.3, 0.3), (4, 1, 1), "rod", velocity=turning,
+        bending=True,
+    )  # fmt: skip
     head = _rigid(
         frame, (1.2, -0.1, -0.1), (1.6, 0.4, 0.4), "head", spin=spin,
         velocity=np.cross(spin, (1.4, 0.15, 0.15)), cells=(1, 1, 1),
@@ -433,10 +435,43 @@ def tipping(frame):
     return nts.System([brick], contacts=[pair], joints=[law], gravity=_gravity(frame))
 
 
+def edges_and_vertices(frame):
+    """Two cubes meet edge across edge, and one of them a vertex of the master between its nodes."""
+
+    def cube(centre, turn, name, size, cells, **options):
+        mesh = frame.grid("hexahedron", (-0.5 * size,) * 3, (0.5 * size,) * 3, (cells,) * 3)
+        mesh.geometry.x[:] = frame.place(frame.back(mesh.geometry.x) @ turn.T + centre)
+        law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+        return nts.Continuum(mesh, law, density=DENSITY, name=name, **options)
+
+    on_edge, half = rotation(np.pi / 4, (1, 0, 0)), np.sqrt(0.5)
+    low = cube((0, 0, -half), on_edge, "low", 1.0, 2)
+    high = cube(
+        (0.05, 0.03, half + 0.0111), rotation(1.2, (0, 0, 1)) @ on_edge, "high", 1.0, 2,
+        velocity=frame.place(0.3, 0.2, -1.0),
+    )  # fmt: skip
+    up = rotation(np.arccos(1 / np.sqrt(3)), (-1, 1, 0))
+    stone = cube(
+        (3.07, 0.04, -0.5112 - 0.25 * np.sqrt(3)), up, "stone", 0.5, 1,
+        velocity=frame.place(0.2, 0.1, 1.0),
+    )  # fmt: skip
+    slab = cube((3.0, 0.0, 0.0), np.eye(3), "slab", 1.0, 2)
+
+    def all_of(body):
+        return body.surface(frame.where(lambda x: np.full(len(x), True)))
+
+    pairs = [
+        nts.ContactPair(all_of(high), all_of(low), friction=0.3),
+        nts.ContactPair(_face(frame, slab, 2, -0.5), all_of(stone), friction=0.3),
+    ]
+    return nts.System([low, high, slab, stone], contacts=pairs)
+
+
 #: Step [s] of each scene.
 SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
     beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
     fold: 2e-3, hoist: 5e-3, of_degree_two: 2e-3, beam_on_a_plate: 1e-3, over_waves: 2e-3,
     laws_in_joints: 1e-2, leaf_on_a_pad: 2e-3, tipping: 5e-3, in_an_angle: 2e-3,
+    edges_and_vertices: 2e-3,
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""What holds for every scene: ledger, momenta, order; no frame, rank or pause matters."""
+"""What holds for every scene: ledger, momenta, order; no frame, rank, pause or rounding matters."""
 
 from functools import cache
 
@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from conformance_scenes import (
     SCENES,
+    beam,
     beam_on_a_plate,
+    block_on_a_plane,
+    edges_and_vertices,
     fold,
     in_an_angle,
     laws_in_joints,
@@ -17,6 +20,8 @@ from conformance_scenes import (
     mechanism,
     of_degree_two,
     over_waves,
+    rigid_on_rubber,
+    sewn,
     tied,
     tipping,
     two_blocks,
@@ -44,15 +49,38 @@ PAUSED = [
     (scene, name) for scene in SCENES for name in INTEGRATORS
     if name == "energy-momentum" or scene in (mechanism, two_blocks)
 ]  # fmt: skip
-#: Each scene by all other integrators; laws that hold and let go have no accelerations.
+#: Laws that hold and let go have no accelerations, nor have nodes without mass.
+UNACCELERATED = (laws_in_joints, tipping, block_on_a_plane)
+
+
+def others(scene):
+    """Names of the other integrators that take a scene."""
+    return [
+        name for name, rule in INTEGRATORS.items()
+        if name != "energy-momentum" and not (scene in UNACCELERATED and rule.accelerations)
+    ]  # fmt: skip
+
+
+#: Each scene by one of them, in turn, and two by each.
 OTHERS = [
-    (scene, name) for scene in SCENES for name, rule in INTEGRATORS.items()
-    if name != "energy-momentum" and not (scene in (laws_in_joints, tipping) and rule.accelerations)
+    (scene, name) for k, scene in enumerate(SCENES) for name in others(scene)
+    if scene in (mechanism, two_blocks) or name == others(scene)[k % len(others(scene))]
 ]  # fmt: skip
 #: Scenes of bodies that nothing holds or drives.
 FREE = (
     two_blocks, tied, fold, of_degree_two, beam_on_a_plate, over_waves, leaf_on_a_pad, in_an_angle,
+    edges_and_vertices,
 )  # fmt: skip
+#: Options of a run, each with a scene on which it acts.
+OPTIONS = {
+    "restored": (two_blocks, {"impact": "restored"}),
+    "adapted": (rigid_on_rubber, {"adapt": nts.Adapt(tolerance=1e-3)}),
+    "asleep": (block_on_a_plane, {"sleep": True}),
+    "kept matrices": (two_blocks, {"newton": nts.Newton(rtol=1e-13, reuse=True)}),
+    "krylov": (leaf_on_a_pad, {"newton": nts.Newton(rtol=1e-13, linear_solver="krylov")}),
+}  # fmt: skip
+#: Scenes whose rest is looked for, too.
+AT_REST = (beam, sewn, rigid_on_rubber)
 scenes = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
 
 
@@ -79,12 +107,20 @@ def end(run, frame):
 def run_of(scene, frame, rule=RULE, *, steps=STEPS, dt=None, **options):
     """The scene's run; places of all bodies at its end, and its balance."""
     dt = SCENES[scene] if dt is None else dt
+    if "newton" not in options:
+        options["accuracy"] = "exact"
     with options.pop("system", None) or scene(frame) as system:
-        run = nts.simulate(
-            system, rule, dt=dt, t_end=steps * dt, accuracy="exact", **options
-        )
+        run = nts.simulate(system, rule, dt=dt, t_end=steps * dt, **options)
         assert run.status.startswith("completed"), run.status
         return end(run, frame), run.balance
+
+
+def rest_of(scene, frame):
+    """Places of all bodies in equilibrium, which stabilization leads to."""
+    with scene(frame) as system:
+        run = nts.equilibrium(system, load_steps=2, stabilization=0.1)
+        assert run.status.startswith("completed"), run.status
+        return end(run, frame)
 
 
 @cache
@@ -152,11 +188,50 @@ def test_no_frame_matters_to_any_integrator(scene, name):
     assert_alike(found, plain(scene, name)[0])
 
 
+@pytest.mark.parametrize("name", OPTIONS)
+def test_no_frame_matters_to_options_of_a_run(name):
+    """And the ledger closes."""
+    scene, options = OPTIONS[name]
+    expected, table = run_of(scene, Frame(), **options)
+    found, _ = run_of(scene, Frame(unit=1e-3, turn=TURN, shuffle=6), **options)
+    assert_alike(found, expected)
+    top = max(np.abs(table[name]).max() for name in ("energy", "external_work"))
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * top
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("scene", AT_REST, ids=lambda scene: scene.__name__)
+def test_no_frame_and_no_rank_matters_at_rest(scene):
+    found = rest_of(scene, Frame())
+    other = Frame(unit=1e3, turn=TURN, shuffle=7, comm=MPI.COMM_SELF)
+    assert_alike(rest_of(scene, other), found)
+
+
 @pytest.mark.skipif(COMM.size == 1, reason="compares ranks")
 @pytest.mark.mpi
 def test_no_rank_matters():
     for scene in SCENES:
         assert_alike(run_of(scene, Frame(comm=MPI.COMM_SELF))[0], plain(scene)[0])
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="compares ranks")
+@pytest.mark.mpi
+@pytest.mark.slow
+@pytest.mark.parametrize("written", ["on all", "on one"])
+def test_a_run_goes_on_on_other_ranks(written, mpi_tmp_path):
+    """A rank alone goes on from a file that all have written, and all from that of one."""
+    half, alone = STEPS // 2, MPI.COMM_SELF
+    first, then = (COMM, alone) if written == "on all" else (alone, COMM)
+    for scene, dt in SCENES.items():
+        name = scene.__name__ + ("" if written == "on all" else f"-{COMM.rank}")
+        saves = nts.Checkpoint(mpi_tmp_path / f"{name}.h5", every=half)
+        run_of(scene, Frame(comm=first), steps=half, checkpoint=saves)
+        COMM.barrier()
+        path = mpi_tmp_path / f"{scene.__name__}{'' if written == 'on all' else '-0'}.h5"
+        frame = Frame(comm=then)
+        system = scene(frame)
+        start = nts.restart(path, system)
+        assert_alike(run_of(scene, frame, system=system, start=start, dt=dt)[0], plain(scene)[0])
 
 
 @pytest.mark.parametrize("ranks", [3, 4])
@@ -190,12 +265,10 @@ def test_no_rounding_matters(scene, monkeypatch):
     assert_alike(found, expected)
 
 
+@pytest.mark.parametrize(("scene", "dt"), [(mechanism, 2e-2), (tied, 2e-3)], ids=["links", "rod"])
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_smooth_scenes_converge_by_the_second_order(name):
-    """Of a mechanism, by halving the step twice."""
-    ends = [
-        run_of(mechanism, Frame(), INTEGRATORS[name], steps=8 * n, dt=2e-2 / n)[0]
-        for n in (1, 2, 4)
-    ]
+def test_smooth_scenes_converge_by_the_second_order(name, scene, dt):
+    """By halving the step twice."""
+    ends = [run_of(scene, Frame(), INTEGRATORS[name], steps=8 * n, dt=dt / n)[0] for n in (1, 2, 4)]
     coarse, fine = (np.linalg.norm(a - b) for a, b in zip(ends, ends[1:], strict=False))
     assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)

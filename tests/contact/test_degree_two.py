@@ -5,8 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from cubes import HALF, ON_EDGE, about_z, turned
-from integrators import CONTACT_RULES, INTEGRATORS
-from measures import difference
+from integrators import INTEGRATORS
 from scenes import CELLS, RUBBER, UNITS, at, bottom, box, everywhere, symmetry, top
 
 import dolfinx_nts as nts
@@ -63,9 +62,7 @@ PAIRS = {
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(
-    ("cells", "degrees", "integration", "friction"), PAIRS.values(), ids=PAIRS
-)
+@pytest.mark.parametrize(("cells", "degrees", "integration", "friction"), PAIRS.values(), ids=PAIRS)
 @pytest.mark.fast("27-sum", "10", "8-10")
 @pytest.mark.fast_on_ranks()
 def test_energy_and_momenta(cells, degrees, integration, friction):
@@ -73,38 +70,6 @@ def test_energy_and_momenta(cells, degrees, integration, friction):
     assert_kept(run)
     rubbed = run.balance["friction_dissipation"]
     assert (np.diff(rubbed) >= 0.0).all() and (rubbed[-1] > 0.0) == bool(friction)
-
-
-@pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
-@pytest.mark.parametrize("rule", INTEGRATORS)
-@pytest.mark.fast("energy-momentum-10")
-def test_integrators(rule, cell):
-    run = fly(thrown((cell, cell)), rule)
-    if rule in CONTACT_RULES:
-        assert_kept(run, energy=rule == "energy-momentum")
-    # Newmark's rule keeps no energy.
-    assert run.status.startswith("completed") and run.balance["min_gap"].min() > -1e-9
-
-
-@pytest.mark.parametrize("cell", [HEX, TET], ids=["27", "10"])
-@pytest.mark.fast("27")
-def test_a_rigid_master(cell):
-    assert_kept(fly(thrown((cell, cell), rigid=True)))
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
-def test_a_restarted_run_is_the_uninterrupted_one(mpi_tmp_path):
-    """On the same ranks, and on each alone."""
-    path = mpi_tmp_path / "run.h5"
-    whole = fly(thrown((TET, HEX)), t_end=0.03)
-    fly(thrown((TET, HEX)), t_end=0.015, checkpoint=nts.Checkpoint(path, every=6))
-    COMM.barrier()
-    for comm, within in ((COMM, 1e-13), (MPI.COMM_SELF, 1e-10)):
-        again = thrown((TET, HEX), comm=comm)
-        run = fly(again, t_end=0.03, start=nts.restart(path, again))
-        assert run.balance["active"].max() >= 4
-        assert difference(whole.balance, run.balance) < within
 
 
 # ---- pressures and forces
@@ -407,9 +372,7 @@ def test_a_curved_mesh_rolls_and_bounces(kind):
     """The curved ring falls on a plane; the nodes of its outer face are the slaves."""
     given = {"density": 1e3, "velocity": (0.5, 0.5, -2.0), "name": "ring"}
     ring = quarter_ring(2)
-    body = (
-        nts.RigidBody(ring, **given) if kind == "rigid" else nts.Continuum(ring, RUBBER, **given)
-    )
+    body = nts.RigidBody(ring, **given) if kind == "rigid" else nts.Continuum(ring, RUBBER, **given)
     outer = body.surface(lambda x: np.hypot(x[0], x[1]) > 2 - 1e-9)
     floor = nts.Plane((2.001, 0, 0), (-1, 0, 0))
     system = nts.System([body], contacts=[nts.ContactPair(outer, floor, friction=0.2)])

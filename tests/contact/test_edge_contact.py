@@ -59,19 +59,6 @@ def test_crossed_edges_rebound_and_keep_energy_and_momenta(rule, angle, friction
     assert table["friction_dissipation"][-1] >= 0.0
 
 
-@pytest.mark.parametrize("metre", [1e3, 1e-3])
-def test_edges_meet_alike_in_other_units(metre):
-    """The same cubes in millimetres or kilometres, with the same mass."""
-    runs = [
-        nts.simulate(
-            crossed(67.0, 0.4, m), nts.EnergyMomentum(), dt=2e-3, t_end=0.04, accuracy="exact"
-        )
-        for m in (1.0, metre)
-    ]
-    ends = [np.array([nts.motion_of(b).velocity for b in run.system.bodies]) for run in runs]
-    np.testing.assert_allclose(ends[1] / metre, ends[0], rtol=1e-9, atol=1e-10)
-
-
 def bars(cells, **upper_options):
     """A bar of tetrahedra above another one across, whose ends are held, edge on edge."""
     side, length, long = 0.1, 1.2, (cells, 1, 1)
@@ -189,6 +176,7 @@ def test_a_run_goes_on_from_its_checkpoint_with_the_forces_of_edges(mpi_tmp_path
 
 def cubes_with_aligned_rims(edges):
     """A cube hits another one of its size flat, spinning and sliding over its rim by 3 mm."""
+
     def velocity(x):
         return np.array([2.0 + 0.5 * (x[2] - 0.5), 0.0 * x[0], -0.5 * (x[0] - 0.5)])
 

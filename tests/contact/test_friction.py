@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType
 from integrators import CONTACT_RULES
-from measures import difference
 from pairs import pairs
 from scenes import CELLS, box, rubbing_blocks
 from twins.friction import return_map
@@ -22,7 +21,6 @@ from dolfinx_nts.kernels.nts_element import invariants, metric, projection
 from dolfinx_nts.solve.convergence import ratios
 
 COMM = MPI.COMM_WORLD
-TO_ROUNDING = nts.Newton(rtol=1e-14, max_iterations=60)
 
 
 # ---- the law
@@ -182,16 +180,6 @@ def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
     assert both >= 3
 
 
-@pytest.mark.slow
-@pytest.mark.mpi
-def test_condensing_changes_nothing():
-    a, b = (
-        run(rubbing_blocks(0.3), newton=nts.Newton(condense=condense)).balance
-        for condense in (False, True)
-    )
-    assert difference(a, b) < 1e-11
-
-
 # ---- prescribed coordinates and nodal results
 def plane_strain_slider(friction, integrator, speed=0.0):
     """A block pressed on a plate, both held across: the slip has one free direction only."""
@@ -251,14 +239,6 @@ def test_prescribed_tangential_direction_carries_no_force(friction, speed, integ
 def test_bad_coefficient(friction):
     with pytest.raises(ValueError, match="friction=.*pass a number >= 0"):
         rubbing_blocks(friction)
-
-
-def test_without_friction_nothing_tangential_is_allocated():
-    stepper = nts.Stepper(rubbing_blocks(0.0), nts.Midpoint())
-    stepper.advance(0.04)
-    counts = [c.widths["constraints"] for c in stepper.problem.elements]
-    assert counts == [1] and stepper.problem.elements[0].law.num_tangential == 0
-    stepper.close()
 
 
 @pytest.mark.parametrize("seed", range(3))

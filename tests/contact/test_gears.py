@@ -116,8 +116,7 @@ def momentum(bodies):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "dt", "end"),
-    [*((way, 1e-4, 0.024) for way in ("pinion", "wheel", "both", "between")),
-     ("wheel", 2.5e-5, 0.006)],
+    [("pinion", 1e-4, 0.024), ("both", 1e-4, 0.024), ("wheel", 2.5e-5, 0.006)],
 )  # fmt: skip
 def test_spur_gears_turn_each_other(way, dt, end):
     """Nodes were held in the plane of a tooth's tip beside the tooth, and the pair jammed.
@@ -154,8 +153,10 @@ def test_spur_gears_turn_each_other(way, dt, end):
 
 @pytest.mark.slow
 @pytest.mark.skipif(COMM.size > 1, reason="takes all cells from one rank")
-@pytest.mark.parametrize("slave", ["pinion", "wheel"])
-@pytest.mark.parametrize("soft", [(False, True), (True, False), (True, True)])
+@pytest.mark.parametrize(
+    ("soft", "slave"),
+    [((False, True), "pinion"), ((True, False), "pinion"), ((True, True), "wheel")],
+)
 def test_gears_of_plastic_turn_each_other_and_stay_apart(soft, slave):
     """Their speed is that of both momenta about their axes, reduced to the pinion."""
     driving, resisting, end = 2.0, 1.0, 0.006

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
+from pairs import pairs
 from scenes import RUBBER
 
 import dolfinx_nts as nts
@@ -85,27 +86,16 @@ def test_dragged_from_stick_to_slip(shape):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.fast("shape3")
+@pytest.mark.parametrize(
+    ("integration", "friction", "rule"), pairs(["nodes", "surface"], [0.3, np.inf], MID_STEP)
+)
+@pytest.mark.fast("nodes-inf-energy-momentum")
 @pytest.mark.fast_on_ranks()
-def test_sticking_nodes_feel_nothing_across(shape):
-    run = dragged(0.6, shape, 0.002, 2)
-    normal, friction, across = forces(run)
-    top = COMM.allreduce(friction.max(initial=0.0), op=MPI.MAX)
-    assert (friction < 0.6 * normal).all() and top > 0
-    assert (across <= 1e-3 * top).all()
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.parametrize("friction", [0.3, np.inf])
-@pytest.mark.parametrize("integration", ["nodes", "surface"])
-@pytest.mark.fast("nodes-0.3-energy-momentum")
-@pytest.mark.fast_on_ranks()
-def test_dynamics_on_a_twisted_plate(integration, integrator, friction):
+def test_dynamics_on_a_twisted_plate(integration, rule, friction):
     """Dragged on from equilibrium the block slides or sticks; the ledger closes."""
     shape, drag = (0.2, 0.5, False), 0.3 if np.isfinite(friction) else 0.02
     start = dragged(friction, shape, drag, 8, integration)
+    integrator = MID_STEP[rule]
     run = nts.simulate(start.system, integrator, dt=2e-3, t_end=2.02, start=start)
     assert run.status == "completed" and run.retries == 0
     table = run.balance

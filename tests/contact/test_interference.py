@@ -78,14 +78,6 @@ def test_cubes_share_their_overlap(overlap, options):
     assert np.abs(table["external_work"]).max() < 1e-12 * stored
 
 
-@pytest.mark.slow
-def test_the_ledger_closes_as_the_square_of_the_load_steps():
-    runs = [nts.equilibrium(cubes(0.005), load_steps=n) for n in (1, 2, 4)]
-    left = [run.balance["ledger_residual"][-1] for run in runs]
-    assert left[0] / left[1] == pytest.approx(4.0, rel=1e-2)
-    assert left[1] / left[2] == pytest.approx(4.0, rel=1e-2)
-
-
 def test_overlap_goes_in_proportion_to_the_pseudo_time():
     run = nts.equilibrium(cubes(0.02), load_steps=[0.25, 0.5])
     for row, time in ((1, 0.25), (2, 0.5)):
@@ -178,15 +170,6 @@ def lame(interference):
     outer = (HUB**2 + FIT**2) / (HUB**2 - FIT**2)
     inner = (FIT**2 + BORE**2) / (FIT**2 - BORE**2)
     return interference * YOUNG / ((1.0 - POISSON**2) * FIT * (outer + inner))
-
-
-@pytest.mark.slow
-def test_a_pin_pressed_into_a_hole():
-    """The smooth surface is off at the ends of the quarter; the slow test has finer meshes."""
-    found = pressed(2e-3, (24, 16), smoothing=True)
-    assert found == pytest.approx(lame(2e-3), rel=0.03)
-    unit = 2.0**-10
-    assert pressed(2e-3, (24, 16), smoothing=True, unit=unit) == pytest.approx(found, rel=1e-9)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from cubes import HALF, ON_EDGE, turned
 from dolfinx.mesh import CellType, create_box
 from measures import kinds
-from scenes import RUBBER, UNITS, box, everywhere
+from scenes import RUBBER, box, everywhere
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -117,18 +117,6 @@ def test_the_vertex_is_in_no_tetrahedron_of_the_slave():
     assert max(deep) < 1e-3 and min(low) < -0.05
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("metre", UNITS)
-def test_units_do_not_matter(metre, friction):
-    ends = []
-    for m in (1.0, metre):
-        system = thrown(friction=friction, metre=m)
-        run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.05, accuracy="exact")
-        assert run.status == "completed"
-        ends.append(end(system) / [m, m, m, 1, 1, 1])
-    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12, atol=1e-13)
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", [nts.Continuum, nts.RigidBody])
 @pytest.mark.fast_on_ranks()
@@ -201,31 +189,9 @@ def test_a_vertex_pressed_into_a_soft_block_bears_what_the_other_declaration_say
     np.testing.assert_allclose(forces[0], forces[1], rtol=1e-7)
 
 
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_a_run_goes_on_from_its_checkpoint_with_the_forces_of_vertices(mpi_tmp_path):
-    """To the bit in serial; on several ranks MUMPS rounds anew in every run."""
-    path, rule = mpi_tmp_path / "corners.h5", nts.EnergyMomentum()
-    file = nts.Checkpoint(path, every=20)
-    options = {"dt": 1e-3, "accuracy": "exact"}
-    whole = nts.simulate(thrown(friction=0.3), rule, t_end=0.04, **options)
-    first = nts.simulate(thrown(friction=0.3), rule, t_end=0.02, checkpoint=file, **options)
-    pressing = COMM.allreduce(sum(float(c.force.sum()) for c in first.state.contacts))
-    system = thrown(friction=0.3)
-    rest = nts.simulate(system, rule, t_end=0.04, start=nts.restart(path, system), **options)
-    assert pressing > 0.0
-    # There each of 20 steps ends anywhere within Newton's tolerance, and which rank has a node is
-    # by chance.
-    same = {"rtol": 0.0, "atol": 0.0 if COMM.size == 1 else 20 * nts.Newton().rtol}
-    if COMM.size == 1:
-        for a, b in zip(whole.state.u, rest.state.u, strict=True):
-            np.testing.assert_array_equal(a, b)
-    most = np.abs(whole.contact_forces).max()
-    np.testing.assert_allclose(rest.contact_forces / most, whole.contact_forces / most, **same)
-
-
 def thrown_cubes(cells, exchanged=False, t_end=0.02, **options):
     """A cube is thrown at another one, spinning a little; the rims of their faces coincide."""
+
     def velocity(x):
         return np.array([2.0 + 0.5 * (x[2] - 0.5), 0.0 * x[0], -0.5 * (x[0] - 0.5)])
 
@@ -235,9 +201,7 @@ def thrown_cubes(cells, exchanged=False, t_end=0.02, **options):
     right = nts.Continuum(
         box((1.004, 0, 0), (2.004, 1, 1), cells[1]), RUBBER, density=1e3, name="right"
     )
-    faces = [
-        left.surface(lambda x: x[0] > 1 - 1e-9), right.surface(lambda x: x[0] < 1.004 + 1e-9)
-    ]
+    faces = [left.surface(lambda x: x[0] > 1 - 1e-9), right.surface(lambda x: x[0] < 1.004 + 1e-9)]
     pair = nts.ContactPair(*faces[:: -1 if exchanged else 1], **options)
     return nts.simulate(
         nts.System([left, right], contacts=[pair]), nts.EnergyMomentum(), dt=1e-3, t_end=t_end,
@@ -261,6 +225,7 @@ def test_flat_faces_give_what_they_give_without_corners(cells, t_end, monkeypatc
 @pytest.mark.slow
 def test_a_rim_that_slave_nodes_leave_holds_in_their_place(monkeypatch):
     """Both declarations come nearer to contact in the mean, which hardly depends on them."""
+
     def spins(**options):
         moving = [
             nts.motion_of(thrown_cubes((4, 5), e, 0.06, **options).system.bodies[0])
@@ -308,6 +273,7 @@ def test_a_block_that_is_wider_than_a_table_tips_about_its_rim(facets, across):
 
 def test_nodes_that_tilt_beyond_a_rim_are_not_thrown_out_when_they_return():
     """A soft cube of two cells bends over the rim of one of five: it wins no energy there."""
+
     def velocity(x):
         return np.array([2.0 + 0.5 * (x[2] - 0.5), 0.0 * x[0], -0.5 * (x[0] - 0.5)])
 

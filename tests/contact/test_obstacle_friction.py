@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from integrators import CONTACT_RULES
 from measures import STENCIL
+from pairs import pairs
 from point_mass import MASS, STEP, turn
 from scenes import box
 from scenes_obstacles import (
@@ -34,9 +35,9 @@ def drift(time):
 
 
 # ---- the equations of a step
-@pytest.mark.parametrize("state", ["stick", "slip", "off"])
-@pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize(
+    ("name", "integrator", "state"), pairs(OBSTACLES, CONTACT_RULES, ["stick", "slip", "off"])
+)
 def test_tangent_is_the_derivative_of_the_residual(name, integrator, state):
     friction = {"stick": np.inf, "slip": 0.3, "off": 0.3}[state]
     pair = Pair(name, integrator, motion=drift, friction=friction)
@@ -121,9 +122,10 @@ def test_a_mass_slides_down_an_incline(integrator):
     assert rows["slip"][1:].all() and not rows["stick"].any()
 
 
-@pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.parametrize("part", [0.999, 1.001, np.inf])
-@pytest.mark.fast("0.999-energy-momentum", "1.001-midpoint")
+@pytest.mark.parametrize(
+    ("integrator", "part"),
+    [("energy-momentum", 0.999), ("midpoint", 1.001), ("gonzalez contact", np.inf)],
+)
 def test_a_mass_sticks_if_mu_is_at_least_the_slope(integrator, part):
     angle = np.pi / 6
     normal, along = np.array([np.sin(angle), 0, np.cos(angle)]), [np.cos(angle), 0, -np.sin(angle)]
@@ -230,8 +232,7 @@ def shaken(name, scene=None, metre=1.0, integrator="energy-momentum", bounce=Fal
     return x @ scene / metre, v @ scene / metre, rows
 
 
-@pytest.mark.parametrize("bounce", [False, True])
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize(("name", "bounce"), zip(OBSTACLES, [True, False] * 3, strict=False))
 @pytest.mark.fast("plane-True")
 def test_ledger(name, bounce):
     _, _, rows = shaken(name, bounce=bounce, newton=TO_ROUNDING)

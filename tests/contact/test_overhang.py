@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from rotations import random_rotation
 from scenes import at, box, everywhere
 from scipy.spatial.transform import Rotation
 
@@ -52,17 +51,6 @@ def test_distance_from_the_rim_is_told(n, tilt, side):
     assert found.distance == pytest.approx(distance, rel=1e-9)
     assert found.size == pytest.approx(distance / np.ptp(points, axis=0).max(), rel=1e-9)
     assert force[found.node] == 1.0
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
-def test_distance_in_other_units_and_directions(unit):
-    turn = random_rotation(np.random.default_rng(3))
-    points, facets = face(3)
-    force, last = last_row(points)
-    found = overhang(
-        unit * points @ turn.T, facets, 1e-12 * force, unit * TABLE @ turn.T
-    )
-    assert found.distance == pytest.approx(unit * (2.0 - last), rel=1e-9)
 
 
 def test_triangles():
@@ -131,26 +119,6 @@ def test_what_another_contact_holds_does_not_tip():
     assert overhang(points, facets, force, TABLE, held).distance == pytest.approx(0.3, rel=1e-9)
 
 
-@pytest.mark.mpi
-def test_bricks_on_two_bricks():
-    """A bond with 2 cm between the bricks: the upper one, of one cell, rests on its ends."""
-    fixed = dict(motion=(0, 0, 0), rotation=(0, 0, 0))
-    below = [
-        nts.RigidBody(
-            box([x, 0, 0], [x + 1, 0.5, 0.3], 1), density=1e3, name=f"brick {k}", **fixed
-        )
-        for k, x in enumerate((0.0, 1.02))
-    ]  # fmt: skip
-    upper = nts.RigidBody(box([0.51, 0, 0.3], [1.51, 0.5, 0.6], 1), density=1e3, name="upper")
-    face_of = at(2, 0.3)
-    pairs = [nts.ContactPair(upper.surface(face_of), b.surface(face_of)) for b in below]
-    system = nts.System([upper, *below], contacts=pairs, gravity=(0, 0, -9.81))
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
-    weight = 9.81 * upper.mass
-    assert run.contact_forces[-1, :, 2] == pytest.approx([weight / 2, weight / 2], rel=1e-9)
-    assert run.status == "completed" and not run.warnings
-
-
 def slide(n, exchange=False, cells=(5, 3, 1), width=1.0, edges=True, dt=4e-3):
     """A rigid block leaves a table at 2 m/s (n x n facets); half a second.
 
@@ -184,20 +152,6 @@ def test_a_block_that_tips_too_early():
     assert f"inside the rim by {told.worst:.3g}, or " in told.text
     # The centre is over the rim when 0.2 m of the block are; the nodes before it are farther in.
     assert 0.1 < told.worst < 0.4
-
-
-@pytest.mark.slow
-def test_finer_blocks_and_the_table_as_slave_are_right():
-    """A block that edges or corners of the table hold turns as with the table as slave."""
-    exact, spin = slide(1, exchange=True, cells=(160, 5, 1))
-    coarse, fine = slide(1, width=0.38, edges=False), slide(8)
-    # The table as slave is right to first order in dt: 1.829, 1.811, 1.801, ..., 1.792 rad/s.
-    half, quarter = (slide(1, exchange=True, cells=(160, 5, 1), dt=dt)[1] for dt in (2e-3, 1e-3))
-    wide = slide(1, width=0.38)
-    assert wide[1] == pytest.approx(2.0 * quarter - half, rel=1e-3) and not wide[0].warnings
-    assert "contact inside a rim" not in exact.warnings
-    assert coarse[1] > 3.0 * spin and coarse[0].warnings["contact inside a rim"].grave
-    assert fine[1] == pytest.approx(spin, rel=0.02) and fine[0].status == "completed"
 
 
 @pytest.mark.parametrize("edges", [False, True])

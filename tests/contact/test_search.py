@@ -150,21 +150,6 @@ def test_ridge_seen_from_outside_is_a_tie():
         assert np.allclose(found.distance, points[:, 2], rtol=1e-14)
 
 
-@pytest.mark.parametrize("nc", [3, 4])
-def test_units_do_not_matter(nc):
-    rng = np.random.default_rng(5)
-    corners = patch(8, nc, wave=0.3) @ random_rotation(rng).T
-    points = corners.mean(axis=1)[rng.integers(len(corners), size=500)]
-    points = points + rng.normal(scale=0.4, size=points.shape)
-    current = rng.integers(-1, len(corners), 500)
-    metres = closest_facets(points, corners, reach=0.5, current=current)
-    for unit in (1e3, 1e6, 1e-6):
-        other = closest_facets(unit * points, unit * corners, reach=unit * 0.5, current=current)
-        assert np.array_equal(other.facet, metres.facet)
-        assert np.allclose(other.xi, metres.xi, rtol=0, atol=1e-9, equal_nan=True)
-        assert np.allclose(other.distance, unit * metres.distance, rtol=1e-9)
-
-
 @pytest.mark.parametrize("n, m", [(0, 5), (5, 0), (0, 0)])
 def test_empty_input(n, m):
     current = np.full(n, -1)

@@ -40,6 +40,7 @@ def places(own, points):
 
 def crossing_area(one, two):
     """Area common to two convex polygons (k, 2): the hull of corners inside and of crossings."""
+
     def inside(p, polygon):
         edges = np.roll(polygon, -1, axis=0) - polygon
         away = p - polygon
@@ -149,10 +150,3 @@ def test_pairs_are_those_of_boxes():
     high = np.minimum(a.max(axis=1)[:, None], b.max(axis=1)[None] + 0.05)
     expected = np.argwhere((low <= high).all(axis=2))
     assert np.array_equal(np.column_stack([one, two]), expected)
-
-
-def test_any_unit():
-    for metre in (2.0**10, 2.0**-20):
-        a, b = grid((3, 3), jitter=0.0, down=True), grid((4, 5), 0.02)
-        points, scaled = over(a, b), over(metre * a, metre * b, 0.1 * metre)
-        assert all(np.array_equal(x, y) for x, y in zip(points, scaled, strict=True))

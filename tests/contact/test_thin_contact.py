@@ -10,7 +10,6 @@ from dolfinx.mesh import CellType, create_box
 from shells import grid, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
-from dolfinx_nts.output.state_file import previous
 
 EM = nts.EnergyMomentum()
 FAST = (0.3, 0.1, -1.0)
@@ -182,24 +181,6 @@ def test_what_is_hit_sleeps_until_then(case):
         assert MPI.COMM_WORLD.allreduce(np.abs(a - b).max(initial=0.0)) < 1e-10
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_from_a_checkpoint_asleep(tmp_path):
-    """Of a shell that a block will hit, to the bit; it wakes after the restart."""
-    file, ends = tmp_path / "asleep.h5", []
-    for parts in ((0.012,), (0.004, 0.012)):
-        for t_end in parts:
-            bodies, slave, master = meeting("continuum on shell")
-            system = nts.System(bodies, contacts=[nts.ContactPair(slave, master, friction=MU)])
-            run = nts.simulate(
-                system, EM, dt=1e-3, t_end=t_end, sleep=True,
-                checkpoint=nts.Checkpoint(file, every=4) if t_end < 0.012 else None,
-                start=nts.restart(file, system) if t_end > parts[0] else None,
-            )  # fmt: skip
-        assert run.status == "completed" and run.balance["active"].max() > 0
-        ends.append(np.concatenate([body.last_accepted()[0] for body in bodies]))
-    assert (ends[0] == ends[1]).all()
-
-
 def rest(body, surface, weight, friction=0.0):
     """Height at which a body comes to rest on a plane, and the force there."""
     plane = nts.Plane((0, 0, 0), (0, 0, 1))
@@ -354,26 +335,6 @@ def sliding(comm=MPI.COMM_WORLD):
     ])  # fmt: skip
 
 
-@pytest.mark.mpi
-@pytest.mark.skipif(MPI.COMM_WORLD.size == 1, reason="compares ranks with a serial run")
-def test_a_checkpoint_goes_on_on_other_ranks(mpi_tmp_path):
-    """From each rank alone to all of them, of a beam that slides on a plate."""
-    here, world = MPI.COMM_SELF, MPI.COMM_WORLD
-    path = mpi_tmp_path / f"{world.rank}.h5"
-    alone, several = sliding(here), sliding(world)
-    saved = nts.Checkpoint(path, every=2)
-    run = nts.simulate(alone, EM, dt=1e-3, t_end=3e-3, checkpoint=saved)
-    world.barrier()
-    start = nts.restart(previous(mpi_tmp_path / "0.h5"), several)
-    assert len(start.rows) == 3
-    found = nts.simulate(several, EM, dt=1e-3, t_end=3e-3, start=start)
-    assert run.balance["active"].max() > 0
-    assert found.balance["energy"] == pytest.approx(run.balance["energy"], rel=1e-12)
-    for kind, k in (("centreline", 0), ("midsurface", 1)):
-        (_, x), (_, y) = (getattr(s.bodies[k], kind)() for s in (alone, several))
-        assert y == pytest.approx(x, abs=1e-12)
-
-
 def save_impacts(folder):
     """Run and save all impacts."""
     for k, case in enumerate(CASES):
@@ -400,8 +361,7 @@ def test_impacts_on_four_ranks(on_ranks, alone, tmp_path):
         one, several = (nts.load(folder / f"{k}.h5") for folder in (alone, tmp_path))
         for of in ("u", "v"):
             mine, theirs = (
-                np.concatenate([body[of] for body in run.bodies.values()])
-                for run in (one, several)
+                np.concatenate([body[of] for body in run.bodies.values()]) for run in (one, several)
             )
             assert np.abs(mine - theirs).max() < 1e-9 * np.abs(mine).max(), case
 

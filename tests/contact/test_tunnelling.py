@@ -50,40 +50,6 @@ def through(x, d, triangle):
     return part if inside and 0.0 <= part <= 1.0 else np.inf
 
 
-@pytest.mark.parametrize("corners", [3, 4])
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.fast("0-3")
-def test_first_hits_against_all_pairs(corners, seed):
-    random = np.random.default_rng(seed)
-    origin, side = random.uniform(-1, 1, (40, 3)), 0.5 * random.normal(size=(40, 2, 3))
-    shape = [(0, 0), (1, 0), (1, 1), (0, 1)] if corners == 4 else [(0, 0), (1, 0), (0, 1)]
-    facets = np.stack([origin + a * side[:, 0] + b * side[:, 1] for a, b in shape], axis=1)
-    shift = random.normal(size=(40, 1, 3))
-    points, motion = random.uniform(-1.5, 1.5, (80, 3)), 1.5 * random.normal(size=(80, 3))
-    found, when = passages.first_hits(points, motion, facets, np.tile(shift, (1, corners, 1)))
-    parts = [[0, 1, 2], [0, 2, 3]][: corners - 2]
-    for x, d, f, t in zip(points, motion, found, when, strict=True):
-        times = [
-            min(through(x, d - s[0], facet[p]) for p in parts)
-            for facet, s in zip(facets, shift, strict=True)
-        ]
-        assert np.isclose(t, min(times), rtol=1e-9) or t == min(times)
-        assert f == (-1 if np.isinf(t) else int(np.argmin(times)))
-    assert 5 < (found >= 0).sum() < 75
-
-
-def test_hits_on_a_facet_that_turns():
-    """A facet swings by a right angle about its edge and meets a point at rest half-way."""
-    corners = np.array([[[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0]]], dtype=float)[:, ::-1]
-    end = corners.copy()
-    end[..., 0], end[..., 2] = corners[..., 2], corners[..., 0]
-    # The corners move evenly, so that after a part t the facet lies along (1 - t, 0, t).
-    points = np.array([[0.3, 0.5, 0.3], [0.3, 0.5, -0.3]])
-    found, when = passages.first_hits(points, np.zeros((2, 3)), corners, end - corners)
-    assert found.tolist() == [0, -1]
-    assert abs(when[0] - 0.5) < 1e-15
-
-
 def sheet(corners, cells=8):
     """Points of a square of 4 x 4 in the plane z = 0 and its facets, which look upwards."""
     line = np.linspace(-2, 2, cells + 1)
@@ -141,7 +107,6 @@ def test_no_path_slips_through_a_sheet_that_crumples(corners):
 
 
 @pytest.mark.parametrize("corners", [3, 4])
-@pytest.mark.slow
 def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
     """Roots of numpy of the polynomial through four of its values."""
     random = np.random.default_rng(corners)
@@ -215,15 +180,6 @@ def test_a_shot_at_a_thin_plate(aim, integrator):
     assert np.allclose(v, [*aim, (1 - 2 * 0.2) * speed], rtol=0, atol=1e-9 * speed)
 
 
-@pytest.mark.parametrize("miss", [(2.5, 0.0), (0.0, -2.2)])
-def test_a_shot_beside_a_plate_flies_on(miss):
-    body, top = plate()
-    system = shot((*miss, 0.5), (0, 0, -300.0), top, [body])
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.02)
-    assert run.status == "completed" and run.balance["active"].max() == 0
-    assert run.retries == 0
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize(
     "obstacle", [nts.Sphere((0, 0, 0), 0.1), nts.Cylinder((0, 0, 0), (0, 1, 0), 0.1)]
@@ -244,6 +200,7 @@ def test_a_shot_at_a_small_obstacle(obstacle):
 @pytest.mark.fast("midpoint")
 def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator):
     """It passes the plate's edge, sinks below its top, and the plate moves over it and away."""
+
     def sideways(t):
         return (0.6 * np.sin(np.pi * t), 0.0, 0.0)
 
@@ -280,8 +237,7 @@ def test_a_body_that_came_from_beside_is_told_of_once_it_is_inside():
 @pytest.mark.parametrize(
     ("integrator", "accuracy", "dt", "n"),
     [
-        ("energy-momentum", "balanced", 2e-3, 4), ("energy-momentum", "exact", 5e-4, 3),
-        ("midpoint", "exact", 2e-3, 4), ("midpoint", "balanced", 5e-4, 3),
+        ("energy-momentum", "balanced", 2e-3, 4), ("midpoint", "exact", 5e-4, 3),
     ],
 )  # fmt: skip
 @pytest.mark.slow
@@ -356,28 +312,6 @@ def over(meshed, young=1e6, velocity=(0.0, 0.0, 0.0), gravity=9.81, gap=0.2):
 
 @pytest.mark.mpi
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("meshed", "soft", "integrator", "accuracy"),
-    pairs([False, True], [True, False], ["midpoint", "energy-momentum"], ["exact", "balanced"]),
-)
-def test_a_block_at_rest_that_falls_far_in_a_step(meshed, soft, integrator, accuracy):
-    """0.2 m above the floor, and by 1.2 or 0.5 m lower after a step of free fall."""
-    young, gravity, dt = (1e6, 9.81, 0.5) if soft else (1e8, 9810.0, 0.01)
-    system, seen, rule = over(meshed, young, gravity=gravity), Touches(), CONTACT_RULES[integrator]
-    run = nts.simulate(system, rule, dt=dt, t_end=4 * dt, accuracy=accuracy, output=[seen])
-    table, scale = run.balance, np.abs(run.balance["external_work"]).max()
-    assert run.status.startswith("completed") and table["active"].max() == 9
-    assert seen.lowest > -1e-10
-    assert np.allclose(np.diff(table["contact_defect"]), seen.losses, rtol=0, atol=1e-8 * scale)
-    assert np.diff(table["contact_defect"]).min() > -1e-8 * scale
-    missing = ledger_or_word(run, PROMISED[accuracy] if rule.closes_ledger else OPEN)
-    assert (table["energy"] - table["external_work"]).max() <= missing * scale
-    if rule.closes_ledger:
-        assert "ledger" not in run.warnings
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
 @pytest.mark.parametrize("meshed", [False, True])
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 def test_no_first_contact_wins_energy(integrator, meshed):
@@ -413,9 +347,10 @@ def test_no_first_contact_wins_energy(integrator, meshed):
 
 @pytest.mark.mpi
 @pytest.mark.slow
-@pytest.mark.parametrize("accuracy", ["exact", "balanced"])
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.parametrize("speed", [100.0, 300.0])
+@pytest.mark.parametrize(
+    ("speed", "integrator", "accuracy"),
+    pairs([100.0, 300.0], ["midpoint", "energy-momentum"], ["exact", "balanced"]),
+)
 def test_a_shot_at_a_thin_flexible_plate(speed, integrator, accuracy):
     """In a step the block moves by 25 or 75 times the plate's thickness; the plate gives way."""
     half, thickness, gap, dt = 1.0, 0.02, 0.35, 5e-3

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from dolfinx_nts.output import Film, painting
+
 SMALL = {
     "bar_impact": {"elements": 4, "t_end": 0.1},
     "crane": {"dt": 2e-2, "t_end": 0.1},
@@ -17,7 +19,10 @@ SMALL = {
     "leaf_spring": {"cells": 8, "steps": 5, "t_end": 1e-3},
     "mechanisms": {"cases": ("bricard",), "t_end": 0.2},
     "newtons_cradle": {
-        "kinds": ("rigid, touching",), "parts": (0.5,), "cells": 2, "duration": 2e-3,
+        "kinds": ("rigid, touching",),
+        "parts": (0.5,),
+        "cells": 2,
+        "duration": 2e-3,
     },
     "partial_slip": {"scales": (0.01,), "refinement": 0.5},
     "own_problem": {"cells": 2, "steps": 4},
@@ -50,8 +55,15 @@ def test_all_are_here():
 
 @pytest.mark.fast("own_problem")
 @pytest.mark.parametrize("name", SMALL)
-def test_what_a_demo_leaves(name, tmp_path, capfd):
-    demo = importlib.import_module(name)
+def test_what_a_demo_leaves(name, tmp_path, capfd, monkeypatch):
+    """In few patches, films of the first and last state: painting takes most of the time."""
+    demo, init = importlib.import_module(name), Film.__init__
+
+    def brief(film, path, *, every=1, interval=None, **look):
+        init(film, path, every=10**6, **look)
+
+    monkeypatch.setattr(Film, "__init__", brief)
+    monkeypatch.setattr(painting, "_PATCHES", 1)
     demo.main(output=str(tmp_path), progress=True, **SMALL[name])
     assert "step/s" in capfd.readouterr().err.replace("s/step", "step/s")
     fields = [] if name in BARE else [".xdmf", ".h5"]

@@ -5,10 +5,10 @@ import stability as demo
 
 
 @pytest.mark.slow  # in serial: a body of one cell is of one rank
-@pytest.mark.parametrize("scene", list(demo.STEPS))
-def test_newmark_doubles_the_energy_that_energy_momentum_keeps(scene):
-    steps = {scene: demo.STEPS[scene] * 3 // 4}
-    r = demo.main(steps=steps, integrators=("energy-momentum", "newmark"))[scene]
+def test_newmark_doubles_the_energy_that_energy_momentum_keeps():
+    """The shorter of the two scenes."""
+    steps = {"rubbing": demo.STEPS["rubbing"] * 3 // 4}
+    r = demo.main(steps=steps, integrators=("energy-momentum", "newmark"))["rubbing"]
     assert r["energy-momentum"]["status"] == "completed"
     assert r["energy-momentum"]["missing"] <= 1e-8
     # When a cell turns inside out depends on rounding and ranks, that the energy grows does not.

@@ -9,7 +9,7 @@ from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from point_mass import PointMass
-from scenes import UNITS, box
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -116,16 +116,6 @@ def test_friction_beside_a_sleeper():
     a, b, awake = both(lambda: row(friction=(0.1, 0.0, 0.2)), 8, condense=True)
     assert awake[-1] == "abc" and a.solution.balance["slip"].max() > 0
     assert_same(a, b)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("metre", UNITS)
-def test_units_change_nothing(metre):
-    one, awake = run(row(), 7, sleep=True)
-    other, same = run(row(metre), 7, sleep=True)
-    assert awake == same and awake[-1] == "abc"
-    for name in ("active", "newton_iterations"):
-        assert np.array_equal(one.solution.balance[name], other.solution.balance[name])
 
 
 @pytest.mark.mpi

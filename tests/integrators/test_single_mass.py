@@ -30,7 +30,7 @@ def run(system, integrator, steps, **newton):
 @pytest.mark.mpi
 @pytest.mark.parametrize(
     ("integrator", "theta", "turned"),
-    pairs(CONTACT_RULES, [0.0, 0.1, 0.25, 0.49, 0.51, 0.75, 0.99, 1.0, 0.5], [False, True]),
+    pairs(CONTACT_RULES, [0.0, 0.25, 0.49, 0.51, 0.75, 1.0, 0.5], [False, True]),
 )
 @pytest.mark.fast_on_ranks("midpoint-0.75-False", "energy-momentum-0.75-True")
 def test_rebound(integrator, theta, turned):
@@ -63,36 +63,6 @@ def test_rebound_with_the_solver_of_large_scenes(integrator):
     v, _ = run(system, integrator, 2, linear_solver="krylov")
     expected = [-1.0, 1 - 2 * theta, 1 - 2 * theta]
     assert np.allclose(v @ q[:, 2] / SPEED, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("integrator", CONTACT_RULES)
-def test_contact_force_and_momentum(integrator):
-    theta = 0.3
-    system, _ = mass_on_wall(theta * STEP * SPEED, velocity=(0.4, -0.7, -SPEED))
-    v, stepper = run(system, integrator, 1)
-    # m (v_1 - v_0) = h p with v_1 = (1 - 2 theta) v: the tangential velocity is untouched.
-    force = 2 * MASS * SPEED * (1 - theta) / STEP
-    assert np.isclose(COMM.allreduce(stepper.state.contacts[0].force.sum()), force, rtol=1e-12)
-    assert np.allclose(v[1], [0.4, -0.7, (1 - 2 * theta) * SPEED], rtol=0, atol=1e-12 * SPEED)
-    momentum = stepper.solution.balance["linear_momentum"]
-    assert np.allclose(momentum[1] - momentum[0], [0, 0, STEP * force], rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize("integrator", CONTACT_RULES)
-def test_free_flight_under_gravity(integrator):
-    """v exact, x exact for a parabola by both rules; the work of gravity is external."""
-    mass = PointMass(COMM, MASS, (1.0, 2.0, 3.0), (0.5, 0.0, 1.0))
-    gravity = np.array([0.0, -1.0, -9.81])
-    stepper = nts.Stepper(nts.System([mass], gravity=gravity), CONTACT_RULES[integrator])
-    for k in range(1, 6):
-        stepper.advance(STEP)
-        t = k * STEP
-        if COMM.rank == 0:
-            assert np.allclose(mass.v, [0.5, 0, 1] + gravity * t, rtol=0, atol=1e-13)
-            path = np.array([0.5, 0, 1]) * t + 0.5 * gravity * t**2
-            assert np.allclose(mass.u, path, rtol=0, atol=1e-14)
-    assert np.abs(stepper.solution.balance["ledger_residual"]).max() < 1e-12
-    stepper.close()
 
 
 @pytest.mark.mpi

@@ -6,7 +6,6 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from integrators import MID_STEP
 from scenes import UNITS, box
 from scipy.integrate import solve_ivp
 
@@ -225,12 +224,6 @@ def heavy_top(dt, integrator, unit=1.0):
     return np.linalg.norm(top.position / far - right), run.balance
 
 
-def test_a_heavy_top_precesses():
-    error, table = heavy_top(4e-3, nts.EnergyMomentum())
-    assert error == pytest.approx(5.919e-3, rel=5e-4)
-    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
-
-
 # ---- pendulums of two rods, mass 1 and 2, length 1 and 0.7
 M_A, M_B, L_A, L_B, G = 1.0, 2.0, 1.0, 0.7, 9.81
 TIMES = (1e-2, 5e-3, 2.5e-3)
@@ -366,9 +359,7 @@ def test_a_planar_four_bar_with_four_revolutes(thick):
             nts.Revolute(one, other, point=p, axis=Z, name=f"hinge {k}")
             for k, ((one, other), p) in enumerate(zip(ends, (0 * b, b, c, FAR), strict=True))
         ]
-        run = nts.simulate(
-            nts.System(bars, joints=joints), nts.EnergyMomentum(), dt=dt, t_end=0.25
-        )
+        run = nts.simulate(nts.System(bars, joints=joints), nts.EnergyMomentum(), dt=dt, t_end=0.25)
         assert run.status == "completed"
         table = run.balance
         assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
@@ -382,40 +373,6 @@ def test_a_planar_four_bar_with_four_revolutes(thick):
     assert abs(np.log2(ratio) - 2.0) < 0.1
 
 
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.slow
-def test_a_slider_crank(integrator):
-    """Three revolutes and a prismatic joint, also redundant, on the closed kinematics."""
-    angle, length, rate = 0.7, 0.8, 20.0
-    b = tip(angle)
-    v_b = rate * np.cross(Z, b)
-
-    def slide(b):
-        return np.array([b[0] + np.sqrt(length**2 - b[1] ** 2), 0.0, 0.0])
-
-    c = slide(b)
-    v_c = np.array([v_b[0] - b[1] * v_b[1] / (c - b)[0], 0.0, 0.0])
-    crank, link = rod("crank", (0, 0, 0), b, at_q=v_b), rod("link", b, c, v_b, v_c)
-    slider = nts.RigidBody.from_inertia(0.5, (1e-3,) * 3, c, velocity=v_c, name="slider")
-    joints = [
-        nts.Revolute(crank, None, point=(0, 0, 0), axis=Z),
-        nts.Revolute(crank, link, point=b, axis=Z),
-        nts.Revolute(link, slider, point=c, axis=Z),
-        nts.Prismatic(slider, None, point=c, axis=(1, 0, 0)),
-    ]
-    system = nts.System([crank, link, slider], joints=joints)
-    stepper = nts.Stepper(system, integrator)
-    for _ in range(100):
-        stepper.advance(4e-3)
-        b = 2.0 * crank.position
-        assert abs(np.linalg.norm(b) - CRANK) < 1e-12
-        assert np.abs(slider.position - slide(b)).max() < 1e-12
-        assert np.abs(2.0 * link.position - b - slide(b)).max() < 1e-12
-    energy = stepper.solution.balance["energy"]
-    assert np.abs(energy - energy[0]).max() < 1e-11 * energy[0]
-    stepper.close()
-
-
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 0, 1)], dtype=float)
 HINGES = np.array([(0, 1, 0), (0, 0, 1), (1, 0, 0)] * 2, dtype=float)
 
@@ -423,8 +380,7 @@ HINGES = np.array([(0, 1, 0), (0, 0, 1), (1, 0, 0)] * 2, dtype=float)
 def bricard(masses=(1.0,) * 5, **options):
     """Six hinges along the edges of a cube: mobile though counting says it is not."""
     bars = [
-        rod(f"bar {i}", CORNERS[i], CORNERS[i + 1], mass=m, **options)
-        for i, m in enumerate(masses)
+        rod(f"bar {i}", CORNERS[i], CORNERS[i + 1], mass=m, **options) for i, m in enumerate(masses)
     ]
     ends = itertools.pairwise([None, *bars, None])
     joints = [
@@ -544,22 +500,6 @@ def test_a_drive(kind):
     stepper.close()
 
 
-@pytest.mark.slow
-def test_the_work_of_a_drive_is_that_of_its_motion():
-    """Accelerated translation: m v^2/2; the turns of a hinge: J w^2/2 about it."""
-    for kind, speed in (("prismatic", 0.3), ("revolute", 12.0)):
-        body, joint = drive(kind, lambda t, speed=speed: speed * t**2)
-        run = nts.simulate(
-            nts.System([body], joints=[joint]), nts.EnergyMomentum(), dt=1e-2, t_end=1.0
-        )
-        inertia = body.mass
-        if kind == "revolute":
-            arm = np.cross(body.centre - P, N)
-            inertia = body.mass * (0.1 + arm @ arm)
-        right = 0.5 * inertia * (2.0 * speed) ** 2
-        assert abs(run.balance["external_work"][-1] / right - 1.0) < 1e-2
-
-
 # ---- flexible bodies
 def cube(low, name, cells=2, **options):
     low = np.asarray(low, dtype=float)
@@ -594,31 +534,6 @@ def test_points_of_a_flexible_body():
     table = stepper.solution.balance
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"].max()
     assert np.linalg.norm(body.velocity) > 0.05
-    stepper.close()
-
-
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_a_tie():
-    """A cube tied to a rigid body by a face; both fly and turn, and the face stays as it was."""
-    turning = np.array([1.0, 2.0, -1.0])
-    soft = cube((0, 0, 0), "soft", velocity=lambda x: np.cross(turning, x.T).T)
-    body = brick("rigid", (1.3, 0.5, 0.5), np.zeros(3), turning)
-    face = soft.surface(lambda x: x[0] > 1 - 1e-9)
-    system = nts.System([soft, body], joints=[nts.Tie(body, face)])
-    stepper, follow = nts.Stepper(system, nts.EnergyMomentum()), Follow(body)
-    for _ in range(20):
-        state = stepper.advance(1e-2)
-        x = face.positions(state.u[0])
-        right = [follow.point(body, p) for p in face.reference]
-        assert np.abs(x - right).max() < 1e-12
-    table = stepper.solution.balance
-    energy = table["energy"]
-    assert np.abs(energy - energy[0]).max() < 1e-11 * energy[0]
-    assert table["potential"].max() > 1e-6 * energy[0]
-    for name in ("linear_momentum", "angular_momentum"):
-        size = np.abs(table[name]).max()
-        assert np.abs(table[name] - table[name][0]).max() < 1e-12 * size
     stepper.close()
 
 
@@ -792,9 +707,7 @@ def test_only_loops_are_looked_at_for_joints_that_repeat_each_other(joints, tree
 def motor(angle, rate=0.0):
     """A body that a hinge about z turns by an angle."""
     body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), angular_velocity=(0, 0, rate), name="rotor")
-    hinge = nts.Revolute(
-        body, None, point=(0, 0, 0), axis=(0, 0, 1), angle=angle, name="motor"
-    )
+    hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 0, 1), angle=angle, name="motor")
     return body, nts.System([body], joints=[hinge])
 
 

@@ -146,8 +146,9 @@ def cube(low, name, velocity=(0.0, 0.0, 0.0), **options):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("newton", [{}, {"linear_solver": "direct"}, {"linear_solver": "krylov"}])
-@pytest.mark.parametrize("damping", [0.0, 500.0])
+@pytest.mark.parametrize(
+    ("damping", "newton"), [(0.0, {}), (500.0, {}), (500.0, {"linear_solver": "krylov"})]
+)
 @pytest.mark.fast("500.0-newton2")
 @pytest.mark.fast_on_ranks()
 def test_a_spring_between_cubes(damping, newton, mpi_tmp_path):
@@ -178,24 +179,6 @@ def test_a_spring_between_cubes(damping, newton, mpi_tmp_path):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_two_stiff_cubes_vibrate_as_two_masses():
-    """omega^2 = k (1/m + 1/m); the springs' axis goes through both centres."""
-    a, b = cube((0, 0, 0), "a", velocity=(0.1, 0, 0)), cube((2, 0, 0), "b", velocity=(-0.1, 0, 0))
-    k = 1e3
-    spring = Spring(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=k)
-    stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
-    omega, h = np.sqrt(2 * k / 1e3), 0.02
-    # The midpoint rule's own frequency, tan(w h/2) = omega h/2.
-    phase = 2 * np.arctan(omega * h / 2)
-    for n in range(1, 60):
-        state = stepper.advance(h)
-        way = COMM.allreduce(state.u[0].reshape(-1, 3)[:, 0].sum()) / 27
-        assert abs(way - 0.1 / omega * np.sin(n * phase)) < 2e-3 * 0.1 / omega
-    stepper.close()
-
-
-@pytest.mark.mpi
 @pytest.mark.parametrize("rule", INTEGRATORS)
 def test_it_is_its_built_in_twin_with_every_integrator(rule):
     """Two tumbling bodies, held at points beside their centres."""
@@ -203,8 +186,13 @@ def test_it_is_its_built_in_twin_with_every_integrator(rule):
     def energies(kind):
         a, b = (
             nts.RigidBody.from_inertia(
-                mass, (0.1, 0.2, 0.25), centre=(x, 0, 0), velocity=(0, speed, 0),
-                angular_velocity=(1, 2, speed), name=name, comm=COMM,
+                mass,
+                (0.1, 0.2, 0.25),
+                centre=(x, 0, 0),
+                velocity=(0, speed, 0),
+                angular_velocity=(1, 2, speed),
+                name=name,
+                comm=COMM,
             )  # fmt: skip
             for mass, x, speed, name in ((2.0, 0.0, 0.3, "a"), (3.0, 1.0, -0.2, "b"))
         )
@@ -312,7 +300,7 @@ def test_points_are_where_they_were_asked_for():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", [CellType.hexahedron, CellType.tetrahedron])
-@pytest.mark.parametrize("size", [1e-9, 1e-5, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-9, 1e6])
 def test_points_are_found_in_bodies_of_any_size(kind, size):
     """Also on faces, and where cells are not straight; those beside the body are none."""
 
@@ -421,17 +409,6 @@ def test_impacts_give_nothing_back_where_a_joint_of_ones_own_drives():
     system = nts.System([body], joints=[Drive(body, (0.3, 0.4, 0.6), 0.1)])
     with pytest.raises(ValueError, match="impact='restored': joint 'drive' is driven"):
         nts.Stepper(system, nts.EnergyMomentum(), impact="restored")
-
-
-@pytest.mark.mpi
-def test_a_step_with_a_joint_that_fails_is_cut():
-    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(30.0, 0, 0))
-    spring = Spring(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e7)
-    run = nts.simulate(
-        nts.System([a, b], joints=[spring]), nts.EnergyMomentum(), dt=5e-2, t_end=0.1,
-        newton=nts.Newton(max_iterations=1, max_retries=2),
-    )  # fmt: skip
-    assert run.retries == 2 and "not solved after" in run.status
 
 
 class FailingElements(SpringElements):
@@ -587,9 +564,7 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(
-    "rule", ACCELERATED.values(), ids=ACCELERATED
-)
+@pytest.mark.parametrize("rule", ACCELERATED.values(), ids=ACCELERATED)
 @pytest.mark.fast("generalized-alpha")
 def test_first_accelerations_keep_a_joint_of_ones_own(rule):
     """A point that is drawn at 0.1 m/s and 3 m/s^2 out of a cube that flies at 0.1 m/s."""

@@ -126,10 +126,11 @@ def test_a_wheel_stays_on_a_slope_up_to_its_bound(facets, part, rolls):
         assert least * (1 - 1e-6) <= moment <= arm / RADIUS * push * (1 + 1e-6)
 
 
-@rules
+@pytest.mark.slow
 @pytest.mark.skipif(COMM.size > 1, reason="takes 50 s on two ranks")
-def test_a_wheel_rolls_to_rest(rule):
+def test_a_wheel_rolls_to_rest():
     """On a way of v^2/(2 a), a = mu g/(r (1 + I/(m r^2))), by mu N for each radian of it."""
+    rule = MID_STEP["energy-momentum"]
     arm, turn, dt = 0.2 * RADIUS, 0.3, 1e-3
     still, _ = wheel(192)
     slows = arm * G / (RADIUS * pushed(still))
@@ -328,9 +329,7 @@ def test_tangent_is_the_derivative_of_the_element(rule, load):
             "constraints": z[:, size : size + m], "by_unknowns": by_unknowns,
             "spread": np.array(0.0), "normal": np.array([0.6, 0.0, 0.8]),
         }  # fmt: skip
-        (part,) = together(
-            MPI.COMM_SELF, [batch.evaluate(z[:, :size].reshape(x.shape), told)]
-        )
+        (part,) = together(MPI.COMM_SELF, [batch.evaluate(z[:, :size].reshape(x.shape), told)])
         return part
 
     if len(x):

@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 from facet_kinds import CENTRE, FLAT, KINDS
 from measures import relative
-from twins import closest, constraints, laws, obstacle, points, surface
+from twins import laws, surface
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.contact_law import ContactLaw, Rub, Together
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
-from dolfinx_nts.interaction.constraint_elements import ConstraintElements
-from dolfinx_nts.interaction.constraint_rows import Equations
-from dolfinx_nts.kernels import compiled, compiled_law, facets, library, quadratic
+from dolfinx_nts.kernels import compiled, compiled_law, facets, library
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.parallel import need_kernels
 
@@ -234,37 +232,14 @@ def test_rounding_of_slips_leaves_friction_as_unsure_as_said():
         assert not law.unsure(part, off).any()
 
 
-@pytest.mark.parametrize("rule", ["mean-value", "direct"])
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
-def test_obstacles_are_those_of_numpy(shape, friction, rule):
-    rng = np.random.default_rng(9)
-    master = {
-        "plane": nts.Plane((0, 0.1, 0), (1, 2, 3)),
-        "sphere": nts.Sphere((0, 0, 0), 0.8),
-        "cylinder": nts.Cylinder((0.1, 0, 0), (0.1, 0.2, 1), 0.8, inside=True),
-    }[shape]
-    x0 = rng.normal(size=(N, 1, 3))
-    x = x0 + 0.1 * rng.normal(size=x0.shape)
-    measure = ObstacleGap(
-        obstacle=master, start=x0, normal=master.gap(x0[:, 0]).gradient[:, 0], length=np.ones(N),
-        rule=rule, theta=0.5,
-    )  # fmt: skip
-    multiplier = rng.normal(size=(N, 3 if friction else 1))
-    here, there = measure.evaluate(x, None, multiplier), obstacle.element(measure, x, multiplier)
-    assert (here[3] is None) == (there[3] is None) == (not friction)
-    pairs = zip([*here[:3], *(here[3] or ())], [*there[:3], *(there[3] or ())], strict=True)
-    for found, expected in pairs:
-        assert np.abs(found - expected).max() <= 1e-13 * max(1.0, np.abs(expected).max())
-
-
 def test_an_obstacle_of_the_users_own_may_have_numbers_of_any_kind():
     measure = ObstacleGap(
         obstacle=Table(), start=np.ones((3, 1, 3)), normal=np.tile([0.0, 0, 1], (3, 1)),
         length=np.ones(3), rule="direct", theta=0.5,
     )  # fmt: skip
-    x, multiplier = 1.1 * measure.start, np.arange(9.0).reshape(3, 3)
-    here, there = measure.evaluate(x, None, multiplier), obstacle.element(measure, x, multiplier)
+    x, multiplier = 1.125 * measure.start, np.arange(9.0).reshape(3, 3)
+    plane = replace(measure, obstacle=nts.Plane((0, 0, 0), (0, 0, 1)))
+    here, there = (one.evaluate(x, None, multiplier) for one in (measure, plane))
     for found, expected in zip([*here[:3], *here[3]], [*there[:3], *there[3]], strict=True):
         assert np.abs(found - expected).max() < 1e-14
     assert here.normal.dtype == np.float64
@@ -323,26 +298,17 @@ def test_laws_of_sums_are_those_of_numpy(each):
     assert np.abs(tangent - expected).max() < 1e-13
 
 
-@pytest.mark.parametrize("number", [1, 5])
-def test_forces_of_points_are_those_of_nodes(number):
-    rng, nodes, rest = np.random.default_rng(10), 6, 3
-    weights = rng.normal(size=(N, number, nodes))
-    weights[rng.uniform(size=weights.shape) < 0.3] = 0.0
-    residual = rng.normal(size=(N, 3 * number + rest))
-    tangent = rng.normal(size=(N, *residual.shape[1:] * 2))
-    here = compiled_law.to_nodes(weights, residual, tangent)
-    there = points.to_nodes(weights, residual, tangent)
-    for found, expected in zip(here, there, strict=True):
-        assert np.abs(found - expected).max() < 1e-13
-
-
-def test_wrenches_are_those_of_numpy():
+def test_wrenches_are_forces_and_moments_about_the_middle():
     rng = np.random.default_rng(11)
     y, push = rng.normal(size=(2, N, 5, 3))
     places, fixed = rng.uniform(size=(N, 5)) < 0.5, rng.uniform(size=(N, 5, 3)) < 0.3
     places[:, 3] = True
+    number, free = places.astype(float), np.where(fixed, 0.0, push)
+    middle = np.einsum("nk,nki->ni", number, y) / number.sum(axis=1)[:, None]
+    moment = np.cross(y - middle[:, None] * number[:, :, None], free).sum(axis=1)
+    expected = np.column_stack([np.einsum("nk,nki->ni", number, free), moment])
     found = compiled_law.wrenches(y, push, places, fixed)
-    assert np.abs(found - points.wrenches(y, push, places, fixed)).max() < 1e-13
+    assert np.abs(found - expected).max() < 1e-13
 
 
 def test_arrays_that_may_not_be_written_or_are_not_contiguous_are_read():
@@ -381,37 +347,6 @@ def test_projections_near_the_facet_need_no_numpy(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(facets, "project", fail)
             assert np.abs(compiled.project(points, corners, start)[0] - expected).max() < 1e-14
-
-
-@pytest.mark.parametrize("warp", [0.0, 0.2, 1.0])
-@pytest.mark.parametrize("nc", [3, 4])
-def test_closest_points_are_those_of_numpy(nc, warp):
-    rng = np.random.default_rng(6)
-    corners = FLAT[nc] + warp * rng.uniform(-1, 1, (3000, nc, 3))
-    places = rng.uniform(-2, 3, (3000, 3)) * [1, 1, 0.5]
-    # Far from the origin, in small units, and on the facets themselves.
-    corners[:500], places[:500] = corners[:500] + 1e3, places[:500] + 1e3
-    corners[500:1000], places[500:1000] = 1e-6 * corners[500:1000], 1e-6 * places[500:1000]
-    places[1000:1500] = facets.frame(corners[1000:1500], rng.uniform(0, 0.5, (500, 2)))[0]
-    xi, distance = compiled.closest_point(places, corners)
-    there, expected = closest.closest_point(places, corners)
-    size = facets.size(corners)
-    assert (np.abs(distance - expected) < 1e-13 * (size + expected)).all()
-    # Where two points are equally close, either may be told.
-    assert (np.abs(xi - there).max(axis=1) < 1e-9).mean() > 0.999
-    on = facets.shape(xi, nc)[0]
-    found = np.linalg.norm(np.einsum("ni,nij->nj", on, corners) - places, axis=1)
-    assert (np.abs(found - distance) < 1e-12 * (size + expected + 1e3 * (size > 1e-4))).all()
-
-
-def test_closest_points_of_facets_without_area_are_those_of_numpy():
-    corners = np.zeros((3, 4, 3))
-    corners[1, 1:3, 0] = 1.0
-    corners[2, 2:, 1] = 2.0
-    places = np.array([[0.0, 0, 1], [0.5, 1, 0], [3, 4, 0]])
-    for nc in (3, 4):
-        found = compiled.closest_point(places, corners[:, :nc])[1]
-        assert np.array_equal(found, closest.closest_point(places, corners[:, :nc])[1])
 
 
 def test_where_there_is_no_foot_nothing_is_solved():
@@ -459,25 +394,3 @@ def test_what_a_rank_lacks_is_told_on_all(monkeypatch):
         monkeypatch.setattr(library, "load", fail)
     with pytest.raises(RuntimeError, match="no compiler"):
         need_kernels(comm)
-
-
-@pytest.mark.parametrize("theta", [0.5, 0.7])
-@pytest.mark.parametrize(("nodes", "count"), [(3, 6), (8, 3), (4, 1)])
-def test_constraints_are_those_of_numpy(nodes, count, theta):
-    """Some weights are zero, some constraints are linear, and some are lent compliance."""
-    rng = np.random.default_rng(nodes)
-    weights = rng.normal(size=(N, count, 2, nodes)) * (rng.random((N, count, 2, nodes)) < 0.6)
-    weights[::3, :, 0] = 0.0
-    equations = Equations(weights, rng.normal(size=(N, count, 2, 3)), np.zeros((N, count)))
-    x, y0 = rng.normal(size=(2, N, nodes, 3))
-    batch = ConstraintElements(
-        name="joint", sides=(), equations=equations, curvature=quadratic.curvature(weights),
-        rest=x, prescribed=rng.normal(size=(2, N, count)), y0=y0, scale=rng.uniform(1, 2, N),
-        theta=theta, lent=np.where(np.arange(N) % 2, 0.0, 1e-3), extents=np.ones(N),
-        names=("joint",), joint=np.zeros(N, dtype=int), moves=False,
-    )  # fmt: skip
-    own = {"constraints": rng.normal(size=(N, count))}
-    found = batch.evaluate(x, own)
-    expected = constraints.evaluate(batch, x, own)
-    for a, b in zip((found.residual, found.tangent, found.gap), expected, strict=True):
-        assert relative(a, b) < 1e-14

@@ -212,13 +212,6 @@ def test_stress_is_the_derivative_of_the_energy(name):
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_nothing_is_stored_at_rest(name):
-    assert point(name).stored(EYE) == 0.0
-    for rule in ("derivative", "gonzalez", "mean-value"):
-        assert np.abs(point(name, rule).stress(EYE, EYE)).max() < 1e-15 * YOUNG
-
-
-@pytest.mark.parametrize("name", MATERIALS)
 def test_moduli_at_small_strain(name):
     mu, lam = LAME[name]
     size = 1e-3
@@ -264,9 +257,7 @@ def test_terms_of_ogden_that_do_not_fit_are_refused():
 
 # ---- discrete gradients
 @pytest.mark.parametrize("name", MATERIALS)
-@pytest.mark.parametrize(
-    "size", [0.25, 0.1, 3e-2, 1.03e-2, 0.97e-2, 3e-3, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14]
-)
+@pytest.mark.parametrize("size", [0.25, 3e-2, 1.03e-2, 0.97e-2, 1e-3, 1e-6, 1e-10, 1e-14])
 def test_gonzalez_is_directional(name, size):
     rng = np.random.default_rng(2)
     c0 = random_strain(rng, 0.15)
@@ -288,7 +279,7 @@ def test_gonzalez_is_directional_next_to_collapse(name, low):
 
 
 @pytest.mark.parametrize("name", STEEP)
-@pytest.mark.parametrize("size", [0.1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-8, 1e-12])
+@pytest.mark.parametrize("size", [0.1, 1e-2, 1e-3, 1e-4, 1e-8, 1e-12])
 def test_gonzalez_is_directional_for_steep_energies(name, size):
     rng = np.random.default_rng(20)
     c0 = random_strain(rng, 0.01)
@@ -300,7 +291,7 @@ def test_gonzalez_is_directional_for_steep_energies(name, size):
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-@pytest.mark.parametrize("size", [1e-7, 1e-8, 1e-10, 1e-12, 1e-14, 1e-15, 0.0])
+@pytest.mark.parametrize("size", [1e-7, 1e-10, 1e-15, 0.0])
 def test_gonzalez_near_rest_has_no_noise(name, size):
     rng = np.random.default_rng(3)
     c0 = random_strain(rng, 0.15)
@@ -344,15 +335,6 @@ def test_mean_value_converges_for_neo_hooke(points):
         errors.append(error * np.linalg.norm(s) * size)
     rates = np.log2(np.array(errors[:-1]) / errors[1:])
     assert np.abs(rates[-1] - (2 * points + 1)) < 0.1
-
-
-@pytest.mark.slow
-def test_seven_points_leave_nothing_of_a_moderate_increment():
-    rng = np.random.default_rng(7)
-    c0 = random_strain(rng, 0.1)
-    c1 = c0 + 0.1 * random_increment(rng)
-    for name in ("neo-hooke", "mooney-rivlin"):
-        assert directionality_error(name, "mean-value", c0, c1, 7)[0] < 1e-14
 
 
 # ---- bodies

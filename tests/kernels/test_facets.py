@@ -5,7 +5,6 @@ import pytest
 from facet_kinds import FLAT
 from rotations import random_rotation
 from scipy.optimize import minimize
-from twins import closest
 
 from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
@@ -34,18 +33,6 @@ def samples(nc, m):
 
 def surface_point(corners, xi):
     return np.einsum("ni,nij->nj", fc.shape(xi, corners.shape[1])[0], corners)
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_shape_derivatives(nc):
-    rng = np.random.default_rng(1)
-    xi, step = rng.uniform(-1.5, 1.5, (20, 2)), 1e-5
-    _, first, second = fc.shape(xi, nc)
-    for a in range(2):
-        shift = step * np.eye(2)[a]
-        plus, minus = fc.shape(xi + shift, nc), fc.shape(xi - shift, nc)
-        assert np.allclose((plus[0] - minus[0]) / (2 * step), first[..., a], rtol=0, atol=1e-10)
-        assert np.allclose((plus[1] - minus[1]) / (2 * step), second[..., a], rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("nc", KINDS)
@@ -83,11 +70,6 @@ def test_frame(nc):
     assert np.allclose(np.linalg.norm(normal, axis=1), 1.0, rtol=0, atol=1e-15)
     assert np.allclose(np.einsum("naj,nj->na", tangents, normal), 0.0, atol=1e-15)
     assert (normal[:, 2] > 0.0).all()
-
-
-def test_normal_points_along_z_for_counter_clockwise_corners():
-    for nc in KINDS:
-        assert np.array_equal(fc.frame(FLAT[nc][None], np.zeros((1, 2)))[2], [[0.0, 0.0, 1.0]])
 
 
 @pytest.mark.parametrize("nc", KINDS)
@@ -147,16 +129,6 @@ def test_tributary_areas():
 
 
 @pytest.mark.parametrize("nc", KINDS)
-def test_no_facets(nc):
-    none = np.empty((0, nc, 3))
-    assert np.array_equal(fc.tributary_areas(np.empty((0, nc), dtype=int), none, 3), np.zeros(3))
-    assert fc.areas(none).shape == fc.size(none).shape == (0,)
-    assert fc.project(np.empty((0, 3)), none, np.empty((0, 2)))[0].shape == (0, 2)
-    xi, distance = compiled.closest_point(np.empty((0, 3)), none)
-    assert xi.shape == (0, 2) and distance.shape == (0,)
-
-
-@pytest.mark.parametrize("nc", KINDS)
 @pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
 def test_projection_is_orthogonal_to_round_off(nc, unit):
     rng = np.random.default_rng(7)
@@ -169,33 +141,6 @@ def test_projection_is_orthogonal_to_round_off(nc, unit):
     assert converged.all()
     assert np.abs(residual).max() <= 5e-15 * unit**2 * (1.0 + np.abs(xi).max())
     assert excess(xi, nc).max() > 0.5
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_projection_recovers_foot_point_outside_the_facet(nc):
-    rng = np.random.default_rng(8)
-    corners = random_facets(rng, 200, nc, 0.1)
-    xi = 1.2 * inside(rng, 200, nc)
-    point, _, normal = fc.frame(corners, xi)
-    gap = rng.uniform(-0.2, 0.2, (200, 1))
-    found, converged = fc.project(point + gap * normal, corners, xi + 0.1)
-    assert converged.all()
-    assert np.allclose(found, xi, rtol=0, atol=1e-13)
-
-
-def test_projection_converges_quadratically(monkeypatch):
-    corners = random_facets(np.random.default_rng(9), 1, 4, 0.15)
-    points, start = np.array([[0.6, 0.3, 0.1]]), np.zeros((1, 2))
-    exact, _ = fc.project(points, corners, start)
-    errors = []
-    for steps in range(1, 5):
-        monkeypatch.setattr(fc, "_MAX_NEWTON", steps)
-        errors.append(np.abs(fc.project(points, corners, start)[0] - exact).max())
-    assert errors[-1] < 1e-14
-    assert all(
-        later <= 5.0 * earlier**2 + 1e-15
-        for earlier, later in zip(errors, errors[1:], strict=False)
-    )
 
 
 def test_projection_never_moves_away_from_the_point():
@@ -252,18 +197,6 @@ def test_closest_point_against_bounded_minimisation(warp):
 
 
 @pytest.mark.parametrize("nc", KINDS)
-def test_closest_point_inside_is_the_projection(nc):
-    rng = np.random.default_rng(13)
-    corners, xi = random_facets(rng, 500, nc, 0.1), 0.99 * inside(rng, 500, nc)
-    point, _, normal = fc.frame(corners, xi)
-    gap = rng.uniform(-0.1, 0.1, 500)
-    found, distance = compiled.closest_point(point + gap[:, None] * normal, corners)
-    interior = excess(xi + 0.0, nc) == 0.0
-    assert np.allclose(found[interior], xi[interior], rtol=0, atol=1e-13)
-    assert np.allclose(distance, np.abs(gap), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("nc", KINDS)
 def test_closest_point_on_edges_and_corners(nc):
     facet = FLAT[nc]
     outward = facet - facet.mean(axis=0)
@@ -302,17 +235,6 @@ def test_closest_point_of_triangles_without_area():
     assert np.allclose(distance, np.linalg.norm(points - foot, axis=1), rtol=1e-9, atol=0)
 
 
-def test_both_ways_to_the_closest_point_agree():
-    rng = np.random.default_rng(14)
-    corners, points = random_facets(rng, 1000, 4, 0.15), rng.uniform(-1, 2, (1000, 3))
-    local = fc._local(points, corners)
-    convex = closest._is_convex(closest._gram(*local))
-    assert 0.5 < convex.mean() < 1.0
-    xi, _ = compiled.closest_point(points, corners)
-    enumerated = closest._closest_warped(*local)
-    assert np.allclose(enumerated, xi, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("nc", KINDS)
 @pytest.mark.parametrize("warp", [0.1, 0.5])
 def test_closest_point_does_not_depend_on_units_or_motion(nc, warp):
@@ -349,11 +271,3 @@ def test_collapsed_facets():
     xi, distance = compiled.closest_point(points[1:], np.stack([line, dot])[:, :3])
     assert np.isfinite(xi).all()
     assert np.allclose(distance, [2.0, 5.0], rtol=1e-14)
-
-
-def test_point_on_the_surface_has_no_distance():
-    rng = np.random.default_rng(17)
-    for nc in KINDS:
-        corners, xi = random_facets(rng, 200, nc, 0.3), inside(rng, 200, nc)
-        _, distance = compiled.closest_point(surface_point(corners, xi), corners)
-        assert distance.max() < 1e-15

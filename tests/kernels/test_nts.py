@@ -12,9 +12,7 @@ from rotations import random_rotation
 from dolfinx_nts.kernels import discrete_gradient, nts_element
 from dolfinx_nts.kernels import facets as fc
 
-NUM_INVARIANTS = {3: 12, 4: 17, 16: 155, 15: 138}
 RULES = ("mean-value", "gonzalez")
-SIDES = {3: 3, 4: 4, 16: 4, 15: 3}
 #: How far off f is, and what it moves by; polynomials of degree 4 grow fast beside their triangle.
 SPREAD, MOVED = {3: 0.5, 4: 0.5, 16: 0.5, 15: 0.1}, {3: 1.0, 4: 1.0, 16: 1.0, 15: 0.2}
 #: Part of the control points' distance that they are shifted by: 0.2 of corners.
@@ -154,42 +152,7 @@ def random_step(rng, n, nc, motion=0.2):
     return z0, z1, rng.normal(size=(n, 6))
 
 
-def rotated(z, rotation):
-    """The same pairs after a rotation of space; f is no vector in space."""
-    vectors = z[:, :-2].reshape(len(z), -1, 3) @ rotation.T
-    return np.concatenate([vectors.reshape(len(z), -1), z[:, -2:]], axis=1)
-
-
 # ---- invariants and constraints
-@pytest.mark.parametrize("nc", KINDS)
-def test_invariants_are_the_products(nc):
-    z = random_pairs(np.random.default_rng(1), 50, nc)
-    pi = nts_element.invariants(z, nc)
-    assert pi.shape == (50, NUM_INVARIANTS[nc])
-    assert np.allclose(pi, [products(row, nc) for row in z], rtol=0, atol=4e-15)
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_invariant_gradient(nc):
-    z = random_pairs(np.random.default_rng(2), 10, nc)
-    expected = [complex_step(lambda x: products(x, nc), row) for row in z]
-    assert np.allclose(nts_element.invariant_gradient(z, nc), expected, rtol=0, atol=4e-15)
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_midpoint_gradient_gives_exact_differences_of_the_invariants(nc):
-    z0, z1, _ = random_step(np.random.default_rng(3), 50, nc)
-    increment = nts_element.invariants(z1, nc) - nts_element.invariants(z0, nc)
-    gradient = nts_element.invariant_gradient(0.5 * (z0 + z1), nc)
-    assert np.allclose(np.einsum("npz,nz->np", gradient, z1 - z0), increment, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_constraints_state_the_geometry(nc):
-    z = random_pairs(np.random.default_rng(4), 50, nc)
-    found = nts_element.constraints(nts_element.invariants(z, nc), nc)
-    expected = [geometric_constraints(row, nc) for row in z]
-    assert np.allclose(found, expected, rtol=0, atol=4e-15)
 
 
 @pytest.mark.parametrize("nc", KINDS)
@@ -210,37 +173,6 @@ def test_projection_and_normal_satisfy_the_augmented_constraints(nc):
     assert (np.abs(g[:, 1:]).max(axis=1) <= rounding).all()
     value = nts_element.gap(z[:, :-5].reshape(50, nc + 1, 3), xi).value
     assert (np.abs(value - g[:, 0]) <= rounding).all()
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_constraint_gradient(nc):
-    pi = np.random.default_rng(6).normal(size=(10, NUM_INVARIANTS[nc]))
-    pi *= MOVED[nc]
-    expected = [complex_step(lambda p: constraints_of_invariants(p, nc), row) for row in pi]
-    error = 1e-14 if nc != 15 else 1e-15 * np.abs(expected).max()
-    assert np.allclose(nts_element.constraint_gradient(pi, nc), expected, rtol=0, atol=error)
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_constraint_curvature(nc):
-    rng = np.random.default_rng(7)
-    rows = 10 if nc < 15 else 1
-    pi, multiplier = rng.normal(size=(rows, NUM_INVARIANTS[nc])), rng.normal(size=(rows, 6))
-    pi *= MOVED[nc]
-
-    def gradient(p):
-        rows = [complex_step(lambda q: constraints_of_invariants(q, nc), row) for row in p]
-        return np.einsum("nm,nmp->np", multiplier, rows)
-
-    # Over a facet of degree 3, so the stencil is exact.
-    step, error = (0.5, 2e-14) if nc < 15 else (1e-3, 1e-11)
-    found = nts_element.constraint_curvature(pi, multiplier, nc)
-    if nc == 15:
-        # The fifth derivative of what is of degree 7 in f leaves 6e-9 of 100 at a step of 1e-3.
-        step, error = 3e-4, 1e-11 * np.abs(found).max()
-    full = nts_element._full_curvature(found)
-    assert np.array_equal(found, full[:, :, -2:])
-    assert along_one(rng, gradient, pi, full, step) < error
 
 
 # ---- the direct description
@@ -310,30 +242,6 @@ def test_gap_over_a_flat_facet_is_the_height(nc):
     assert np.allclose(g.value, height, rtol=0, atol=2e-15)
     weight = np.concatenate([np.ones((20, 1)), -n], axis=1)
     assert np.allclose(g.gradient, weight[:, :, None] * turn[:, 2], rtol=0, atol=1e-14)
-
-
-def renumbered_corners(nc, shift):
-    """Points of a facet in the order that starts at another corner."""
-    if nc == 15:
-        return np.array([POWERS.tolist().index(np.roll(e, shift).tolist()) for e in POWERS])
-    return np.roll(np.arange(nc).reshape(-1, SIDES[nc]), -shift, axis=1).ravel()
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_gap_does_not_depend_on_the_numbering_of_the_corners(nc):
-    x, xi = random_gaps(np.random.default_rng(10), 20, nc)
-    first = nts_element.gap(x, xi)
-    for shift in range(1, SIDES[nc]):
-        order = np.concatenate([[0], 1 + renumbered_corners(nc, shift)])
-        other = x[:, order]
-        xi, converged = fc.project(other[:, 0], other[:, 1:], np.tile(CENTRE[nc], (20, 1)))
-        g = nts_element.gap(other, xi)
-        assert converged.all()
-        assert np.allclose(g.value, first.value, rtol=0, atol=1e-14)
-        assert np.allclose(g.gradient, first.gradient[:, order], rtol=0, atol=1e-13)
-        rows = (3 * order[:, None] + np.arange(3)).ravel()
-        expected = first.hessian[:, rows][:, :, rows]
-        assert relative(g.hessian, expected) < 1e-12
 
 
 # ---- the element in invariants
@@ -410,38 +318,6 @@ def test_tangents(nc, rule):
     assert np.allclose(e.constraint_gradient, geometry, rtol=0, atol=2e-14)
 
 
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("nc", KINDS)
-def test_momentum(nc, rule):
-    z0, z1, multiplier = random_step(np.random.default_rng(15), 100, nc)
-    force = nts_element.element(z0, z1, multiplier, rule).force
-    middle = (0.5 * (z0 + z1))[:, :-2].reshape(100, nc + 2, 3)
-    vectors = force[:, :-2].reshape(100, nc + 2, 3)
-    scale = np.abs(force).max()
-    assert np.abs(vectors[:, :-1].sum(axis=1)).max() < 1e-14 * scale
-    # Rotating x and d leaves the invariants alone, hence sum x cross F + d cross F_d = 0.
-    assert np.abs(np.cross(middle, vectors).sum(axis=1)).max() < 1e-14 * scale
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_units(nc):
-    """Metres to millimetres: the mean value does not notice, Gonzalez's formula does."""
-    mm = 1e3
-    z0, z1, multiplier = random_step(np.random.default_rng(16), 50, nc)
-    lengths = np.concatenate([np.full(3 * (nc + 1), mm), np.ones(5)])
-    # lambda . g is an energy: multiplied by mm as g is by (mm, mm, mm, 1, mm^2, mm^2).
-    conjugate = np.array([1, 1, 1, mm, 1 / mm, 1 / mm])
-    scale_force = np.concatenate([np.ones(3 * (nc + 1)), np.full(5, mm)])
-    difference = {}
-    for rule in RULES:
-        here = nts_element.element(z0, z1, multiplier, rule).force
-        there = nts_element.element(lengths * z0, lengths * z1, conjugate * multiplier, rule).force
-        difference[rule] = relative((there / scale_force)[:, :-5], here[:, :-5])
-    assert difference["mean-value"] < 2e-15
-    # Over a triangle the constraints are quadratic in pi: nothing is left to correct.
-    assert difference["gonzalez"] > 1e-4 if nc > 3 else difference["gonzalez"] < 2e-15
-
-
 def test_over_triangles_both_rules_are_the_midpoint_gradient():
     z0, z1, multiplier = random_step(np.random.default_rng(20), 50, 3)
     middle = 0.5 * (nts_element.invariants(z0, 3) + nts_element.invariants(z1, 3))
@@ -469,45 +345,6 @@ def test_at_rest(nc, rule):
 
     # A discrete gradient is symmetric in both ends: its tangent at rest is half the Hessian.
     assert along_one(rng, force, z, 2.0 * e.stiffness) < 2e-9 * np.abs(e.stiffness).max()
-
-
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("nc", KINDS)
-def test_rotation_equivariance(nc, rule):
-    rng = np.random.default_rng(18)
-    z0, z1, multiplier = random_step(rng, 20, nc)
-    turn = random_rotation(rng)
-    here = nts_element.element(z0, z1, multiplier, rule)
-    there = nts_element.element(rotated(z0, turn), rotated(z1, turn), multiplier, rule)
-    assert np.allclose(there.constraint, here.constraint, rtol=0, atol=1e-14)
-    assert relative(there.force, rotated(here.force, turn)) < 1e-14
-    blocks = np.eye(z0.shape[1])
-    for k in range(nc + 2):
-        blocks[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = turn
-    assert relative(there.stiffness, blocks @ here.stiffness @ blocks.T) < 1e-14
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_forces_do_not_depend_on_the_numbering_of_the_corners(nc):
-    """Corners shifted by one: f' = A f + b, and the covariant multipliers turn with A."""
-    a, b = {
-        3: (np.array([[0.0, 1], [-1, -1]]), np.array([0.0, 1])),
-        4: (np.array([[0.0, 1], [-1, 0]]), np.zeros(2)),
-    }[SIDES[nc]]
-    z0, z1, multiplier = random_step(np.random.default_rng(19), 20, nc)
-    order = np.concatenate([[0], 1 + renumbered_corners(nc, 1), [nc + 1]])
-
-    def renumbered(z):
-        vectors = z[:, :-2].reshape(len(z), nc + 2, 3)[:, order]
-        return np.concatenate([vectors.reshape(len(z), -1), z[:, -2:] @ a.T + b], axis=1)
-
-    other = multiplier.copy()
-    other[:, 1:3], other[:, 4:] = multiplier[:, 1:3] @ a.T, multiplier[:, 4:] @ a.T
-    here = nts_element.element(z0, z1, multiplier, "mean-value").force
-    there = nts_element.element(renumbered(z0), renumbered(z1), other, "mean-value").force
-    expected = here[:, :-2].reshape(20, nc + 2, 3)[:, order].reshape(20, -1)
-    assert relative(there[:, :-2], expected) < 1e-14
-    assert relative(there[:, -2:], here[:, -2:] @ np.linalg.inv(a)) < 1e-14
 
 
 @pytest.mark.parametrize("nc", KINDS)

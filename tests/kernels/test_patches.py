@@ -98,33 +98,6 @@ def along_edge(k, backwards=False):
 
 
 # ---- shape functions
-def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
-    values, _, _ = patches.shape(CORNER)
-    assert np.array_equal(values, np.eye(16)[:4])
-    xi = np.random.default_rng(1).uniform(-1.5, 1.5, (30, 2))
-    for k, derivative in enumerate((*patches.shape(xi), patches.third(xi))):
-        assert np.allclose(derivative.sum(axis=1), k == 0, rtol=0, atol=1e-14)
-
-
-def test_derivatives():
-    """Of polynomials of degree 3 in each coordinate: this stencil is exact."""
-    xi, step = np.random.default_rng(2).uniform(-1.5, 1.5, (20, 2)), 0.25
-    functions = [lambda p, k=k: patches.shape(p)[k] for k in range(3)] + [patches.third]
-    for low, high in zip(functions[:-1], functions[1:], strict=True):
-        for a in range(2):
-            shift = step * np.eye(2)[a]
-            near, far = (low(xi + m * shift) - low(xi - m * shift) for m in (1, 2))
-            expected = (8 * near - far) / (12 * step)
-            assert np.allclose(high(xi)[..., a], expected, rtol=0, atol=1e-13)
-
-
-def test_polynomial_along_a_direction():
-    rng = np.random.default_rng(3)
-    xi, step = rng.uniform(-1, 1, (2, 20, 2))
-    coefficients = patches.along(xi, step)
-    for t in (0.0, 0.3, 1.0, -2.0):
-        found = coefficients @ t ** np.arange(7.0)
-        assert np.allclose(found, patches.shape(xi + t * step)[0], rtol=0, atol=1e-12)
 
 
 def test_control_points_on_a_plane_grid_give_the_plane_map():
@@ -216,16 +189,6 @@ def test_irregular_points_are_named_and_the_rest_is_smooth():
     irregular = net(x, hole)[1]
     around = [f for f in range(len(hole)) if np.intersect1d(hole[f], facets[14]).size]
     assert np.array_equal(np.flatnonzero(irregular), around)
-
-
-def test_patches_do_not_depend_on_the_numbering():
-    rng = np.random.default_rng(9)
-    for x, facets in surfaces(rng).values():
-        control, _ = net(x, facets)
-        rolled = np.roll(facets, -1, axis=1)
-        other, _ = net(x, rolled)
-        expected = np.roll(control.reshape(-1, 4, 4, 3), -1, axis=2).reshape(control.shape)
-        assert np.allclose(other, expected, rtol=0, atol=1e-14)
 
 
 def test_order_of_a_cylinder():

@@ -5,7 +5,7 @@ import pytest
 from facet_kinds import LINE
 from scipy.spatial import ConvexHull, Delaunay
 
-from dolfinx_nts.kernels import compiled, patches
+from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels import triangle_patches as tp
 
@@ -131,41 +131,6 @@ def beside(control, pairs):
     return sides
 
 
-# ---- shape functions
-def test_shape_functions_sum_to_one_and_are_one_at_their_corner():
-    assert np.array_equal(tp.shape(CORNER)[0], np.eye(15)[:3])
-    xi = np.random.default_rng(1).uniform(-0.2, 1.2, (30, 2))
-    for k, derivative in enumerate((*tp.shape(xi), tp.third(xi))):
-        assert np.allclose(derivative.sum(axis=1), k == 0, rtol=0, atol=1e-12)
-
-
-def test_derivatives():
-    """Of polynomials of degree 4 this stencil is exact."""
-    xi, step = np.random.default_rng(2).uniform(0, 1, (20, 2)), 0.25
-    functions = [lambda p, k=k: tp.shape(p)[k] for k in range(3)] + [tp.third]
-    for low, high in zip(functions[:-1], functions[1:], strict=True):
-        for a in range(2):
-            shift = step * np.eye(2)[a]
-            near, far = (low(xi + m * shift) - low(xi - m * shift) for m in (1, 2))
-            assert np.allclose(high(xi)[..., a], (8 * near - far) / (12 * step), rtol=0, atol=2e-12)
-
-
-def test_polynomial_along_a_direction():
-    rng = np.random.default_rng(3)
-    xi, step = rng.uniform(-1, 1, (2, 20, 2))
-    coefficients = tp.along(xi, step)
-    for t in (0.0, 0.3, 1.0, -1.0):
-        found = coefficients @ t ** np.arange(5.0)
-        assert np.allclose(found, tp.shape(xi + t * step)[0], rtol=0, atol=1e-11)
-
-
-def test_powers_are_those_of_the_shape_functions():
-    xi = np.random.default_rng(4).uniform(0, 1, (20, 2))
-    power = xi[:, :, None] ** np.arange(5)
-    found = np.einsum("na,nb,abi->ni", power[:, 0], power[:, 1], tp.COEFFICIENTS)
-    assert np.allclose(found, tp.shape(xi)[0], rtol=0, atol=1e-13)
-
-
 # ---- how patches meet
 @pytest.mark.parametrize("name", SURFACES)
 def test_patches_interpolate_and_leave_no_gaps(name):
@@ -284,9 +249,7 @@ def test_order_on_a_sphere():
         piece = tp.piece(area[:, 1:])
         found = np.einsum("na,mnai->mni", tp.shape(area[:, 1:])[0], control[:, piece])
         flat = np.einsum("na,mai->mni", area, x[t])
-        error[n], facet[n] = (
-            np.abs(np.linalg.norm(p, axis=2) - 1).mean() for p in (found, flat)
-        )
+        error[n], facet[n] = (np.abs(np.linalg.norm(p, axis=2) - 1).mean() for p in (found, flat))
     rate = np.log2(error[100] / error[1600]) / 2
     assert rate > 3.0
     assert error[400] < facet[400] / 30
@@ -321,10 +284,3 @@ def test_projection_onto_patches():
         scaled, same = fc.project(unit * slave, unit * control, xi)
         assert same.all()
         assert np.allclose(scaled, xi, rtol=0, atol=1e-9)
-
-
-def test_pieces_lie_beside_their_edges():
-    for k in range(3):
-        middle = (CORNER[k] + CORNER[(k + 1) % 3] + 0.2 * CORNER[(k + 2) % 3]) / 2.2
-        assert tp.piece(middle[None]) == [k]
-    assert patches.NUM_POINTS == 16 and tp.NUM_POINTS == 15

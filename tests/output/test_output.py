@@ -17,7 +17,6 @@ from dolfinx_nts.kernels.facets import tributary_areas
 from dolfinx_nts.ledger import balance
 from dolfinx_nts.output import pictures, plots
 
-h5py = pytest.importorskip("h5py")
 image = pytest.importorskip("matplotlib.image")
 
 COMM = MPI.COMM_WORLD
@@ -247,22 +246,6 @@ def test_a_run_that_dies_keeps_what_was_written(mpi_tmp_path):
 
 
 @mpi
-def test_files_are_complete_after_every_step(mpi_tmp_path):
-    run = nts.Stepper(thrown_block(), nts.Midpoint())
-    fields, table = output.Fields(mpi_tmp_path), output.BalanceCSV(mpi_tmp_path / "b.csv")
-    fields.start(run)
-    table.start(run)
-    for k in range(3):
-        assert len(read_xdmf(mpi_tmp_path / "body.xdmf").fields) == k + 1
-        assert (mpi_tmp_path / "b.csv").read_text().count("\n") == k + 2
-        COMM.Barrier()
-        steps(run, fields, 1)
-        table.write(run)
-    table.close(run)
-    run.close()
-
-
-@mpi
 def test_a_failed_run_leaves_its_last_accepted_state(mpi_tmp_path):
     run = nts.Stepper(thrown_block(), nts.Midpoint())
     writer = output.Fields(mpi_tmp_path, every=100)
@@ -288,7 +271,10 @@ def test_a_second_run_replaces_the_files(mpi_tmp_path):
 def test_csv_is_the_balance(mpi_tmp_path):
     path = mpi_tmp_path / "new" / "balance.csv"
     run = nts.simulate(
-        meeting_blocks(), nts.EnergyMomentum(), dt=1e-3, t_end=4e-3,
+        meeting_blocks(),
+        nts.EnergyMomentum(),
+        dt=1e-3,
+        t_end=4e-3,
         output=[output.BalanceCSV(path)],
     )
     header, *lines = (a for a in path.read_text().splitlines() if not a.startswith("#"))

@@ -92,16 +92,6 @@ def test_touching_at_rest_stays_at_rest(place, integrator):
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
-@pytest.mark.fast_on_ranks("energy-momentum-across")
-def test_touching_and_leaving_takes_no_force(place, integrator):
-    table = run(scene(place, velocity=(0.0, 0.0, 1.0)), integrator)
-    assert table["active"].sum() == 0
-    np.testing.assert_allclose(table["linear_momentum"][:, 2], 1250.0, rtol=1e-12)
-    np.testing.assert_allclose(table["kinetic"], 625.0, rtol=1e-12)
-
-
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 @pytest.mark.fast_on_ranks("midpoint-edge")
 def test_touching_and_sliding_takes_no_force(place, integrator):
     """Frictionless sliding over edges of facets, at zero gap all the time."""
@@ -122,13 +112,8 @@ def test_pressed_from_zero_gap(place, integrator):
         assert np.abs(table["contact_defect"]).max() <= ROUND_OFF * table["energy"][0]
 
 
-@pytest.mark.parametrize("place", PLACES)
-@rubbing
-@pytest.mark.fast(
-    "midpoint-0.0-edge", "midpoint-0.3-corner", "energy-momentum-0.0-across",
-    "energy-momentum-0.3-inside",
-)  # fmt: skip
-@pytest.mark.fast_on_ranks("energy-momentum-0.0-across")
+@pytest.mark.parametrize(("place", "friction"), zip(PLACES, [0.3, 0.0, 0.3, 0.0], strict=True))
+@pytest.mark.fast_on_ranks("energy-momentum-across-0.0")
 def test_falls_onto_edges_and_corners(place, integrator, friction):
     table = run(scene(place, gap=0.003, velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
     assert table["active"].max() == 4
@@ -200,23 +185,6 @@ def test_held_slaves_driven_against_a_held_master_have_nothing_to_solve(integrat
     table = run(system, integrator)
     assert table["active"].max() == 0
     assert np.isinf(table["min_gap"]).all()
-
-
-@pytest.mark.parametrize("place", ["inside", "corner"])
-@rubbing
-@pytest.mark.fast("energy-momentum-0.3-corner")
-@pytest.mark.fast_on_ranks()
-def test_contact_comes_and_goes(place, integrator, friction):
-    """Two bounces under gravity on a plate that is held below."""
-    held = [nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)]
-    system = scene(
-        place, gap=0.01, velocity=(0, 0, -1), plate=held, gravity=(0, 0, -20), friction=friction
-    )
-    table = run(system, integrator, dt=4e-3, steps=90)
-    touches = table["active"] > 0
-    assert np.count_nonzero(np.diff(touches.astype(int)) == 1) >= 2
-    assert np.count_nonzero(np.diff(touches.astype(int)) == -1) >= 2
-    assert np.ptp(table["potential"]) > 0
 
 
 @rubbing
@@ -318,8 +286,9 @@ def test_the_same_gap_closed_twice_is_refused_or_as_closed_once(friction, integr
 def test_nodes_between_two_that_do_not_yield_are_named(by, integrator):
     """Driven at 1 m/s at a plane that is 1 cm away they have nowhere to go from 0.01 s on."""
     mesh = create_box(COMM, [[0, 0, 0.01], [1, 1, 1.01]], [1, 1, 1], CellType.hexahedron)
-    low, above = (lambda x: x[2] < 0.02), nts.Plane(
-        (0, 0, 0.02), (0, 0, -1), motion=lambda t: (0.0, 0.0, -t), name="above"
+    low, above = (
+        (lambda x: x[2] < 0.02),
+        nts.Plane((0, 0, 0.02), (0, 0, -1), motion=lambda t: (0.0, 0.0, -t), name="above"),
     )
     held = nts.Dirichlet(low, components=(2,), value=lambda t: (0.0, 0.0, -t))
     bcs = [held] if by == "support" else []

@@ -131,33 +131,6 @@ def test_it_is_called_with_chosen_steps():
     assert len(calls) > len(time)
 
 
-@pytest.mark.parametrize("adapt", [None, nts.Adapt()])
-def test_a_run_keeps_what_it_has_if_it_raises(adapt):
-    body, _ = pulled()
-    calls = Calls(until=1.5 * DT)
-    run = nts.simulate(
-        nts.System([body]), nts.Midpoint(), dt=DT, t_end=5 * DT, adapt=adapt, before_step=calls
-    )
-    assert len(set(COMM.allgather(run.status))) == 1
-    assert run.status.startswith(f"before_step at t={calls[-1][0]!r} with dt=")
-    assert "raised KeyError('table'), line" in run.status
-    assert run.retries == 0
-    time = run.balance["time"]
-    assert len(time) > 1 and time[-1] == calls[-1][0] and time[-2] < 1.5 * DT
-
-
-def test_a_stepper_learns_the_cause_and_goes_on():
-    body, _ = pulled()
-    calls = Calls(until=0.0)
-    stepper = nts.Stepper(nts.System([body]), nts.Midpoint(), before_step=calls)
-    with pytest.raises(nts.UserFunctionError, match="^before_step at t=0.0 with") as caught:
-        stepper.advance(DT)
-    assert isinstance(caught.value.__cause__, KeyError) == (COMM.rank == COMM.size - 1)
-    calls.until = np.inf
-    assert np.isclose(stepper.advance(DT).time, DT)
-    stepper.close()
-
-
 def test_a_material_that_it_changes_is_in_the_ledger():
     """A cube held in a stretch of 1.1: its energy is in proportion to the modulus."""
     mesh = box()
@@ -204,18 +177,9 @@ def test_equilibrium_calls_it_with_pseudo_times():
     )
 
 
-def test_equilibrium_keeps_what_it_has_if_it_raises():
-    body, _ = pulled([nts.Dirichlet(lambda x: x[2] < 1e-9)])
-    run = nts.equilibrium(nts.System([body]), load_steps=4, before_step=Calls(until=0.5))
-    assert run.status.startswith("before_step at t=0.5 with dt=0.25: ")
-    assert np.allclose(run.balance["time"], [0, 0.25, 0.5])
-
-
 def test_it_must_be_callable():
     with pytest.raises(TypeError, match="before_step=3: pass a callable"):
-        nts.simulate(
-            nts.System([pulled()[0]]), nts.Midpoint(), dt=DT, t_end=DT, before_step=3
-        )
+        nts.simulate(nts.System([pulled()[0]]), nts.Midpoint(), dt=DT, t_end=DT, before_step=3)
 
 
 class Writes:

@@ -14,10 +14,9 @@ pytestmark = pytest.mark.mpi
 DT = 2e-3
 
 
-@pytest.mark.parametrize(("first_steps", "steps"), [(12, 20), (13, 23)], ids=["12", "13"])
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
 @pytest.mark.slow
-def test_two_parts_are_the_whole(integrator, first_steps, steps):
+def test_two_parts_are_the_whole(integrator, first_steps=13, steps=23):
     """With friction, in contact where the first one ends; on several ranks MUMPS rounds anew."""
     newton = nts.Newton(linear_solver="direct", condense=True)
     whole, system = rubbing_blocks(0.3), rubbing_blocks(0.3)

@@ -1,6 +1,5 @@
 """Rigid bodies and joints in runs of every kind: sleeping, adaptive, balanced, continued."""
 
-import numpy as np
 import pytest
 
 import dolfinx_nts as nts
@@ -19,58 +18,6 @@ def scene(name=""):
         nts.Spherical(one, two, point=(1, 0, 0), name="elbow"),
     ]
     return nts.System([one, two, rests], joints=joints, gravity=(0, 0, -G))
-
-
-def places(system):
-    return np.concatenate([body.position for body in system.bodies])
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize(
-    ("options", "promise"),
-    [({}, 1e-11), ({"sleep": True}, 1e-11), ({"accuracy": "balanced"}, 1e-8)],
-    ids=["exact", "sleep", "balanced"],
-)
-@pytest.mark.fast_on_ranks("balanced")
-def test_the_ledger_of_a_double_pendulum(options, promise):
-    system = scene()
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1, **options)
-    table = run.balance
-    size = np.abs(table["external_work"]).max()
-    assert run.status == "completed" and run.retries == 0
-    assert np.abs(table["ledger_residual"]).max() < promise * size
-    known = scene()
-    nts.simulate(known, nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
-    assert places(system) == pytest.approx(places(known), abs=1e-6)
-
-
-@pytest.mark.slow
-def test_adaptive_steps_of_a_double_pendulum():
-    system, known = scene(), scene()
-    run = nts.simulate(
-        system, nts.EnergyMomentum(), dt=0.05, t_end=0.5, adapt=nts.Adapt(tolerance=1e-3)
-    )
-    nts.simulate(known, nts.EnergyMomentum(), dt=1e-3, t_end=0.5)
-    size = np.abs(run.balance["external_work"]).max()
-    assert run.status == "completed"
-    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * size
-    assert np.abs(places(system) - places(known)).max() < 5e-3
-
-
-@pytest.mark.parametrize(
-    "rule", [nts.EnergyMomentum(), nts.GeneralizedAlpha()], ids=["em", "ga"]
-)
-@pytest.mark.fast("ga")
-def test_two_halves_are_one_run(rule):
-    """A run that goes on remembers the joints' multipliers."""
-    whole, first, second = scene(), scene(), scene()
-    run = nts.simulate(whole, rule, dt=5e-3, t_end=0.2)
-    half = nts.simulate(first, rule, dt=5e-3, t_end=0.1)
-    rest = nts.simulate(second, rule, dt=5e-3, t_end=0.2, start=half)
-    assert rest.status == run.status == "completed"
-    assert places(second) == pytest.approx(places(whole), abs=1e-11)
-    for name in ("pivot", "elbow"):
-        assert rest.reactions[name][-1] == pytest.approx(run.reactions[name][-1], abs=1e-6)
 
 
 @pytest.mark.mpi

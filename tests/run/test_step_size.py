@@ -10,7 +10,7 @@ import two_blocks
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
-from scenes import UNITS, fail_once, rubbing_blocks
+from scenes import fail_once
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
@@ -249,51 +249,6 @@ def test_rejected_steps_leave_no_trace():
     for name in ("energy", "contact_defect", "kinetic"):
         assert np.abs(replayed[name] - table[name]).max() < 1e-11 * table["energy"][0], name
     stepper.close()
-
-
-@pytest.mark.mpi
-@pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-def test_ranks_take_the_steps_of_a_serial_run():
-    parallel, serial = impact(cells=(3, 2)), impact(MPI.COMM_SELF, cells=(3, 2))
-    assert parallel.balance["active"].max() > 3
-    a, b = parallel.balance, serial.balance
-    assert np.allclose(a["time"], b["time"], rtol=1e-9, atol=0)
-    assert len({tuple(t) for t in COMM.allgather(a["time"].tolist())}) == 1
-    assert np.abs(a["energy"] - b["energy"]).max() < 1e-9 * b["energy"][0]
-
-
-@pytest.mark.slow
-@pytest.mark.mpi
-def test_metres_millimetres_micrometres():
-    runs = [
-        impact(
-            metre=m,
-            density=1e3 / m**3,
-            material=nts.NeoHookean(young=1e6 / m, poisson=0.3),
-        )
-        for m in (1.0, *UNITS)
-    ]
-    first = runs[0].balance
-    for run in runs[1:]:
-        assert run.rejected == runs[0].rejected
-        assert np.allclose(run.balance["time"], first["time"], rtol=1e-9, atol=0)
-        assert np.array_equal(run.balance["newton_iterations"], first["newton_iterations"])
-
-
-@pytest.mark.slow
-@pytest.mark.mpi
-def test_the_ledger_is_closed_with_friction():
-    system = rubbing_blocks(0.3)
-    run = nts.simulate(
-        system, nts.EnergyMomentum(), dt=8e-3, t_end=0.06, adapt=nts.Adapt(tolerance=5e-4)
-    )
-    table = run.balance
-    assert run.status == "completed" and run.rejected > 0
-    assert table["stick"].max() > 0 and table["slip"].max() > 0
-    assert np.diff(table["friction_dissipation"]).min() >= 0
-    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
-    momentum = table["linear_momentum"]
-    assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.abs(momentum[0]).max()
 
 
 @pytest.mark.mpi

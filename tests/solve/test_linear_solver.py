@@ -10,7 +10,6 @@ from measures import difference
 from petsc4py import PETSc
 
 import dolfinx_nts as nts
-from dolfinx_nts import petsc_compat
 from dolfinx_nts.equations import node_blocks
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.solve import fieldsplit, linear_solver
@@ -52,13 +51,6 @@ def stepper_of(system, **options):
 )
 def test_choice(size, contact, inertia, given, preset):
     assert linear_solver.choose(size, contact, inertia, given) == preset
-
-
-def test_more_iterations_are_worth_it_on_larger_meshes():
-    for preset, least in (("krylov", 60), ("multigrid", 10)):
-        sizes = (1, 1_000, 5_000, 50_000, 500_000)
-        limits = [linear_solver.most_iterations(preset, n) for n in sizes]
-        assert limits[:2] == [least, least] and limits == sorted(limits) and limits[-1] < 1_000
 
 
 @pytest.mark.slow
@@ -202,24 +194,6 @@ def test_schur_complement():
     stepper.close()
 
 
-def test_schur_complement_saves_iterations():
-    """On one rank; on more the bodies' preconditioner takes most of them."""
-    counts = []
-    for options in (None, {"pc_fieldsplit_schur_precondition": "selfp"}):
-        newton = nts.Newton(linear_solver="krylov")
-        stepper = nts.Stepper(
-            pressed_block(0.3), nts.EnergyMomentum(), newton=newton, petsc_options=options
-        )
-        count = 0
-        for _ in range(25):
-            stepper.advance(1e-3)
-            if stepper.solution.rows[-1]["active"] >= 30:
-                count += stepper.solver.snes.getLinearSolveIterations()
-        counts.append(count)
-        stepper.close()
-    assert 0 < counts[0] < 0.85 * counts[1]
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.fast("True")
@@ -238,19 +212,6 @@ def test_contact_part_by_a_solver_of_the_user(condense):
     assert difference(*tables) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("given", "ours"),
-    [
-        ({}, True),
-        ({"pc_fieldsplit_schur_precondition": "selfp"}, False),
-        ({"pc_fieldsplit_type": "additive"}, False),
-        ({"pc_type": "lu"}, False),
-    ],
-)
-def test_who_chooses_the_schur_complement(given, ours):
-    assert linear_solver.SolverOptions(COMM, "krylov", True, given).schur == ours
-
-
 def test_who_failed_is_told():
     newton = nts.Newton(linear_solver="krylov", max_retries=0)
     options = {"ksp_max_it": 1, "ksp_rtol": 1e-14}
@@ -260,20 +221,6 @@ def test_who_failed_is_told():
     )  # fmt: skip
     told = "the linear solver 'krylov' failed, KSP reason -3, with petsc_options={'ksp_max_it': 1, "
     assert told in run.status and "linear_solver='auto'" in run.status
-
-
-@pytest.mark.parametrize(
-    ("preset", "given", "ours"),
-    [
-        ("krylov", {}, True),
-        ("krylov", {"ksp_rtol": 1e-8}, True),
-        ("krylov", {"fieldsplit_bodies_pc_type": "gamg"}, False),
-        ("krylov", {"pc_type": "lu"}, False),
-        ("direct", {}, False),
-    ],
-)
-def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
-    assert linear_solver.SolverOptions(COMM, preset, True, given).blocked == ours
 
 
 @pytest.mark.mpi
@@ -312,9 +259,7 @@ def test_matrix_in_blocks_of_nodes(cells, masters):
     assert bodies.getType().endswith("baij") and bodies.getInfo()["mallocs"] == 0
     problem = stepper.problem
     e = problem.evaluate(problem.x)
-    other = StepMatrix(
-        problem.laid.layout, problem.tangents.at(e), problem.laid.blocks, split=True
-    )
+    other = StepMatrix(problem.laid.layout, problem.tangents.at(e), problem.laid.blocks, split=True)
     tangents = [part.tangent for part in e.parts] if problem.laid.blocks else []
     matrix.assemble(tangents, fresh=True)
     other.assemble(tangents)
@@ -331,28 +276,6 @@ def test_matrix_in_blocks_of_nodes(cells, masters):
         matrix.assemble(tangents, fresh=False)
     other.destroy()
     stepper.close()
-
-
-@pytest.mark.mpi
-def test_rows_of_a_matrix_without_copying():
-    """Against PETSc's own, for a matrix whose ranks hold columns of each other's, or no rows."""
-    local = [3, 5, 0, 4][COMM.rank % 4]
-    a = PETSc.Mat().createAIJ(((local, None), (local, None)), nnz=30, comm=COMM)
-    start, stop = a.getOwnershipRange()
-    rng = np.random.default_rng(COMM.rank)
-    for i in range(start, stop):
-        for j in np.unique(rng.integers(0, a.getSize()[1], 4)):
-            a.setValue(i, j, rng.uniform(1, 2))
-    a.assemble()
-    whole = np.zeros((local, a.getSize()[1]))
-    for pointer, column, number, value in petsc_compat.csr_parts(a):
-        row = np.repeat(np.arange(local), np.diff(pointer))
-        whole[row, number[column]] += value
-    pointer, column, value = a.getValuesCSR()
-    expected = np.zeros_like(whole)
-    expected[np.repeat(np.arange(local), np.diff(pointer)), column] = value
-    assert np.array_equal(whole, expected) and (local == 0 or whole.any())
-    a.destroy()
 
 
 @pytest.mark.mpi
@@ -384,31 +307,6 @@ def test_rows_that_are_whole_only_one_after_another():
             a.setValues(row, np.arange(3 * node, 3 * node + 3, dtype=PETSc.IntType), np.ones(3))
     a.assemble()
     assert node_blocks.patterns([a]) is None
-    a.destroy()
-
-
-@pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize("nodes", [1, 2, 3])
-def test_elements_are_added_whatever_the_order_of_their_values_in_memory(nodes, held):
-    """Of two elements, with or without a coordinate that is held, against a dense sum."""
-    rng = np.random.default_rng(nodes)
-    a = PETSc.Mat().createBAIJ(((24, None), (24, None)), 3, nnz=8, comm=MPI.COMM_SELF)
-    numbers = np.stack([3 * rng.permutation(8)[:nodes, None] + np.arange(3) for _ in range(2)])
-    numbers = numbers.reshape(2, -1)
-    numbers[1, 1] = -1 if held else numbers[1, 1]
-    values, expected = rng.uniform(1, 2, (2, 3 * nodes, 3 * nodes)), np.zeros((24, 24))
-    for number, value in zip(numbers, values, strict=True):
-        kept = np.flatnonzero(number >= 0)
-        expected[np.ix_(number[kept], number[kept])] += value[np.ix_(kept, kept)]
-    columns = np.arange(3 * nodes)
-    wide = np.pad(values, ((0, 0), (2, 1), (2, 1)), constant_values=9.0)
-    for first, each in ((0, values), (0, np.asfortranarray(values)), (2, wide)):
-        if a.assembled:
-            a.zeroEntries()
-        sums = node_blocks.NodeSums(first + columns, numbers)
-        sums.add(a, sums.of(each))
-        a.assemble()
-        assert np.array_equal(a.getValues(range(24), range(24)), expected)
     a.destroy()
 
 

@@ -11,6 +11,7 @@ import two_blocks
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from measures import difference
+from pairs import pairs
 from petsc4py import PETSc
 from processes import in_fresh_python
 from scenes import rubbing_blocks
@@ -201,8 +202,9 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.parametrize("scene", ["smooth", "frictional"])
+@pytest.mark.parametrize(
+    ("scene", "integrator"), zip(["smooth", "frictional"], MID_STEP, strict=True)
+)
 @pytest.mark.slow
 def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integrator, scene):
     """Approach, impact and separation."""
@@ -226,11 +228,10 @@ def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integra
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integrator", MID_STEP)
-@pytest.mark.parametrize("master", ["plane", "plate"])
-@pytest.mark.fast("plane-midpoint-0.3", "plate-midpoint-0.0", "plate-energy-momentum-0.3")
-@pytest.mark.fast_on_ranks("plate-energy-momentum-0.3")
+@pytest.mark.parametrize(
+    ("master", "integrator", "friction"), pairs(["plane", "plate"], MID_STEP, [0.0, 0.3])
+)
+@pytest.mark.fast_on_ranks("plate-midpoint-0.3")
 def test_idle_candidates_wake_in_the_step_that_closes_their_gap(
     monkeypatch, master, integrator, friction
 ):

@@ -12,7 +12,6 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
-from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.study import scene_runs, tradeoff
 
 COMM = MPI.COMM_WORLD
@@ -83,29 +82,10 @@ def test_error_of_the_trajectory_is_of_second_order(script):
 
 
 @pytest.mark.slow
-@pytest.mark.mpi
-def test_adaptive_steps_beside_equal_ones(script):
-    """`dt` is the largest step; more and smaller steps for a smaller tolerance, less error."""
-    vary = {"dt_factor": [2.0], "adapt": [None, 1e-2, 1e-3]}
-    rows = tradeoff.compare(script, vary, {}, {"dt_factor": 1 / 8}, COMM)
-    equal, coarse, fine = rows[1:]
-    assert [r["dt [s]"] for r in rows[1:]] == [0.04] * 3 and equal["steps"] == 5
-    assert equal["rejected"] == 0 and 0.0 < fine["cpu [s]"] < 60.0
-    assert 5 < coarse["steps"] < fine["steps"]
-    assert fine["trajectory"] < coarse["trajectory"] < 0.1
-
-
-@pytest.mark.slow
 def test_mesh_refinement_compares_with_another_mesh(script):
     rows = tradeoff.compare(script, {"cells": [1, 2, 3]}, {"dt": 0.01}, {"cells": 6}, COMM)
     errors = [r["trajectory"] for r in rows[1:]]
     assert errors == sorted(errors, reverse=True)
-
-
-def test_sleep_is_a_choice(script):
-    rows = tradeoff.compare(script, {"sleep": [False, True]}, {}, {"dt_factor": 0.5}, COMM)
-    assert [r["sleep"] for r in rows[1:]] == [False, True]
-    assert rows[1]["trajectory"] == rows[2]["trajectory"] > 0
 
 
 def test_affine_motion_has_a_closed_form(script):
@@ -194,11 +174,6 @@ def test_the_reference_takes_a_quarter_of_a_step_that_is_set(script, tmp_path):
     rows = tradeoff.main([script, "--set", "dt=0.04", "--output", str(tmp_path)])
     assert [r["dt [s]"] for r in rows] == [0.01, 0.04, 0.04, 0.04]
     assert all(0 < r["trajectory"] < 0.1 for r in rows[1:])
-
-
-def test_levels_of_accuracy_are_ordered():
-    fast, balanced, exact = (ACCURACY[name].rtol for name in ("fast", "balanced", "exact"))
-    assert fast > balanced > exact
 
 
 def test_a_script_with_a_module_beside_it(tmp_path):
