@@ -12,7 +12,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.types import FloatArray
 
 #: Iterations in which nodes touch or stick otherwise than before until their laws are blurred: in a
@@ -27,6 +27,9 @@ _NEAR = 0.8
 _SHARPER = 0.01
 #: Iterations at a width until it is taken that many times larger.
 _PATIENCE, _WIDER = 4, 10.0
+#: Updates that make the residual that many times larger are halved, at most so often: most grow at
+#: first, and shorter ones take longer.
+_GROWS, _HALVINGS = 10.0, 4
 #: Width over the first one from which on gaps are no more blurred: equations that repeat others
 #: have the compliance of the blurred law alone, which is that of the square of the width.
 _PARTED = 1e-3
@@ -114,6 +117,36 @@ class BlurredContacts:
             return self._steepened(x), False
         self._width *= _SHARPER
         return self._blurred(x), True
+
+    def shorten(self, last: Evaluation, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Scale an update y that SNES subtracts from x; tells whether it did. Collective.
+
+        Newton's method may run away from blurred laws where steps turn bodies far.
+
+        Args:
+            last: The iterate.
+            x: Its unknowns.
+            y: The update.
+        """
+        if not self.blurs:
+            return False
+        least, part, trial = _GROWS * self._norm(last), 1.0, x.duplicate()
+        for _ in range(_HALVINGS):
+            trial.waxpy(-part, y, x)
+            if self._norm(self._blurred(trial)) < least:
+                break
+            part *= 0.5
+        trial.destroy()
+        if part == 1.0:
+            return False
+        y.scale(part)
+        return True
+
+    def _norm(self, e: Evaluation) -> float:
+        """Of the residual. Collective."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.square(self._problem.residual(e)).sum()
+        return float(np.sqrt(global_sum(self._problem.system.comm, np.array([square]))[0]))
 
     def _begins(
         self, batches: Sequence[ContactElements], both: Sequence[tuple[Contribution, Contribution]]
