@@ -18,8 +18,8 @@ from dolfinx_nts.types import FloatArray
 #: Iterations in which nodes touch or stick otherwise than before until their laws are blurred: in a
 #: heap most steps settle by the fifth, and to blur and sharpen takes eight more.
 _CLEAR = 6
-#: The first width, over the largest of the lengths by which nodes that do not settle press, have
-#: slid or lie behind.
+#: The first width, over the largest of the lengths by which nodes that do not settle miss their
+#: laws, forces over the masses that they move.
 _FIRST = 0.1
 #: A blurred law counts as solved where rows miss less than this part of widths and bounds; ...
 _NEAR = 0.8
@@ -153,16 +153,16 @@ class BlurredContacts:
     ) -> bool:
         """Choose the widths; whether there is anything to blur. Collective.
 
-        What a blow elsewhere presses by says nothing of those that change.
+        How far it is to a solution is told by what nodes that change miss, and not by what they
+        press or have slid: two that hold the same place may change by turns for next to nothing.
         """
         largest, least = 0.0, np.inf
         for batch, (last, part) in zip(batches, both, strict=True):
-            changes = (last.status != part.status).any(axis=0)
-            # One that just left presses and has slid in the iterate before alone.
-            for each in (last, part):
-                press = -each.multiplier[:, 0] / batch.law.yielding
-                for length in (press, each.distance, -each.gap):
-                    largest = max(largest, float(length[changes].max(initial=0.0)))
+            law, changes = batch.law, (last.status != part.status).any(axis=0)
+            rows = np.abs(batch.law_rows(part))
+            rows[:, 0] /= np.where(part.active, law.scale, law.yielding)
+            rows[:, 1:] /= np.where(part.stick, law.scale, law.yielding)[:, None]
+            largest = max(largest, float(rows[changes].max(initial=0.0)))
             least = min(least, float(batch.law.still.min(initial=np.inf)))
         sizes = global_max(self._problem.system.comm, np.array([largest, -least]))
         self._width, self._last = _FIRST * float(sizes[0]), -float(sizes[1])
