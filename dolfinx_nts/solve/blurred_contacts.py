@@ -16,8 +16,8 @@ from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.types import FloatArray
 
 #: Iterations in which nodes touch or stick otherwise than before until their laws are blurred: in a
-#: heap most steps settle by the fifth, and to blur and sharpen takes eight more.
-_CLEAR = 6
+#: heap most steps settle by the fifth, and those that do not hardly ever do later.
+_CLEAR = 4
 #: The first width, over the largest of the lengths by which nodes that do not settle miss their
 #: laws, forces over the masses that they move.
 _FIRST = 0.1
