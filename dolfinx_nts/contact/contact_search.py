@@ -389,7 +389,7 @@ class ContactSearch:
         relaxations of a load step, they are its forces.
         """
         c, multipliers = self.elements[k], self.carried(k)
-        if c.pair.redundant:
+        if c.pair.redundant and self._carried is self._old:
             # Else rounding adds up over steps in forces that sticking nodes exert on each other.
             multipliers[:, 1:] = 0.0
         solved = self._carried is not self._old or (self._step.dt == 0.0 and self.carried_any())

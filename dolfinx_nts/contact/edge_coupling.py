@@ -415,7 +415,9 @@ class EdgeCoupling:
         at = np.array([where.get(int(i), -1) for i in self._key(self._chosen)], dtype=int)
         force = np.append(old.force, 0.0)[at]
         tangential = np.vstack([old.tangential, np.zeros(3)])[at]
-        found = c.multipliers(force, np.zeros_like(tangential) if c.law.redundant else tangential)
+        if c.law.redundant and old is self._history:
+            tangential = np.zeros_like(tangential)
+        found = c.multipliers(force, tangential)
         guess: FloatArray = self._step.factor * found / c.law.scale[:, None]
         return guess
 

@@ -157,8 +157,10 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     """
     mesh = body.mesh
     blocks = body_facets(body, compat.exterior_facets(mesh)).corners
-    moved = fem.Function(body.space)
-    here = body.at_mesh(u)
-    moved.x.array[: len(here)] = here
-    moved.x.scatter_forward()
-    return node_places(body)[blocks] + moved.x.array.reshape(-1, 3)[blocks]
+    values = body.at_mesh(u)
+    if mesh.comm.size > 1:
+        moved = fem.Function(body.space)
+        moved.x.array[: len(values)] = values
+        moved.x.scatter_forward()
+        values = moved.x.array
+    return node_places(body)[blocks] + values.reshape(-1, 3)[blocks]

@@ -12,14 +12,14 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.parallel import anywhere, global_max, global_sum
 from dolfinx_nts.types import FloatArray
 
 #: Iterations in which nodes touch or stick otherwise than before until their laws are blurred: in a
-#: heap most steps settle by the fifth, and to blur and sharpen takes eight more.
-_CLEAR = 6
-#: The first width, over the largest of the lengths by which nodes that do not settle press, have
-#: slid or lie behind.
+#: heap most steps settle by the fifth, and those that do not hardly ever do later.
+_CLEAR = 4
+#: The first width, over the largest of the lengths by which nodes that do not settle miss their
+#: laws, forces over the masses that they move.
 _FIRST = 0.1
 #: A blurred law counts as solved where rows miss less than this part of widths and bounds; ...
 _NEAR = 0.8
@@ -27,6 +27,9 @@ _NEAR = 0.8
 _SHARPER = 0.01
 #: Iterations at a width until it is taken that many times larger.
 _PATIENCE, _WIDER = 4, 10.0
+#: Updates that make the residual that many times larger are halved, at most so often: most grow at
+#: first, and shorter ones take longer.
+_GROWS, _HALVINGS = 10.0, 4
 #: Width over the first one from which on gaps are no more blurred: equations that repeat others
 #: have the compliance of the blurred law alone, which is that of the square of the width.
 _PARTED = 1e-3
@@ -115,21 +118,51 @@ class BlurredContacts:
         self._width *= _SHARPER
         return self._blurred(x), True
 
+    def shorten(self, last: Evaluation, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Scale an update y that SNES subtracts from x; tells whether it did. Collective.
+
+        Newton's method may run away from blurred laws where steps turn bodies far.
+
+        Args:
+            last: The iterate.
+            x: Its unknowns.
+            y: The update.
+        """
+        if not self.blurs:
+            return False
+        least, part, trial = _GROWS * self._norm(last), 1.0, x.duplicate()
+        for _ in range(_HALVINGS):
+            trial.waxpy(-part, y, x)
+            if self._norm(self._blurred(trial)) < least:
+                break
+            part *= 0.5
+        trial.destroy()
+        if part == 1.0:
+            return False
+        y.scale(part)
+        return True
+
+    def _norm(self, e: Evaluation) -> float:
+        """Of the residual. Collective."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.square(self._problem.residual(e)).sum()
+        return float(np.sqrt(global_sum(self._problem.system.comm, np.array([square]))[0]))
+
     def _begins(
         self, batches: Sequence[ContactElements], both: Sequence[tuple[Contribution, Contribution]]
     ) -> bool:
         """Choose the widths; whether there is anything to blur. Collective.
 
-        What a blow elsewhere presses by says nothing of those that change.
+        How far it is to a solution is told by what nodes that change miss, and not by what they
+        press or have slid: two that hold the same place may change by turns for next to nothing.
         """
         largest, least = 0.0, np.inf
         for batch, (last, part) in zip(batches, both, strict=True):
-            changes = (last.status != part.status).any(axis=0)
-            # One that just left presses and has slid in the iterate before alone.
-            for each in (last, part):
-                press = -each.multiplier[:, 0] / batch.law.yielding
-                for length in (press, each.distance, -each.gap):
-                    largest = max(largest, float(length[changes].max(initial=0.0)))
+            law, changes = batch.law, (last.status != part.status).any(axis=0)
+            rows = np.abs(batch.law_rows(part))
+            rows[:, 0] /= np.where(part.active, law.scale, law.yielding)
+            rows[:, 1:] /= np.where(part.stick, law.scale, law.yielding)[:, None]
+            largest = max(largest, float(rows[changes].max(initial=0.0)))
             least = min(least, float(batch.law.still.min(initial=np.inf)))
         sizes = global_max(self._problem.system.comm, np.array([largest, -least]))
         self._width, self._last = _FIRST * float(sizes[0]), -float(sizes[1])

@@ -85,6 +85,10 @@ class Iterates:
         self._joints.try_again()
         self._contacts.try_again()
 
+    def shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Scale an update y that leads away from blurred laws; tells whether it did. Collective."""
+        return self._contacts.shorten(self.at(x), x, y)
+
     def _forget(self) -> None:
         self.last: Evaluation | None = None
         self.known: list[tuple[PETSc.Vec, int]] = []

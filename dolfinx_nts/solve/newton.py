@@ -258,7 +258,8 @@ class StepSolver:
     def _check_update(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Hold prescribed coordinates, which a multigrid moves a little, and shorten updates."""
         y.array_w[self.problem.laid.held] = 0.0
-        return self._upright.shorten(x, y)
+        shortened = self._upright.shorten(x, y)
+        return self.iterates.shorten(x, y) or shortened
 
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
