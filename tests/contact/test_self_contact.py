@@ -334,7 +334,7 @@ def candidates(mesh):
     system = nts.System([body], contacts=[contact])
     (depth,) = system.penetration(system.initial_state())
     assert not depth.any()
-    (found,) = system._facing(system.initial_state())
+    ((_, found),) = system._facing(system.initial_state())
     return COMM.allreduce(len(found.node))
 
 
