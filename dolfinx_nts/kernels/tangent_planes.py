@@ -106,7 +106,9 @@ def _fit(linear: FloatArray, p: FloatArray) -> FloatArray:
     """
     (n, r, u), (s, t) = linear.shape, p.transpose(2, 0, 1)
     rows = np.zeros((n, r + 3, u + 3))
-    rows[:, :r, :u], rows[:, :r, u:] = linear, np.stack([s * s, s * t, t * t], axis=2)
+    # So scaled, what a second derivative weighs is the same in any axes of the plane.
+    mixed = np.sqrt(2.0) * s * t
+    rows[:, :r, :u], rows[:, :r, u:] = linear, np.stack([s * s, mixed, t * t], axis=2)
     rows[:, r:, u:] = _RIDGE * np.eye(3)
     return np.linalg.pinv(rows)[:, :u, :r]
 
