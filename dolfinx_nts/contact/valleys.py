@@ -125,12 +125,13 @@ def tell_met(found: dict[int, ContactElements], own: Sequence[int]) -> None:
         found: Candidates of contacts by their number, which are replaced.
         own: Of each contact its number, or that of the one that it is added to.
     """
-    for k, valley in list(found.items()):
-        if not isinstance(valley.pair, Valleys) or valley.pair.redundant:
+    for k, more in list(found.items()):
+        pair = more.pair
+        if pair.of is None or pair.exchanged or pair.redundant or own[k] not in found:
             continue
-        for i in {own[k], k}:
-            meets = np.isin(found[i].candidates.node, valley.candidates.node)
-            law = found[i].law
+        both = np.intersect1d(found[own[k]].candidates.node, more.candidates.node)
+        for i in (own[k], k):
+            meets, law = np.isin(found[i].candidates.node, both), found[i].law
             found[i] = replace(found[i], law=replace(law, meets=law.meets | meets))
 
 
