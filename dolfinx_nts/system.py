@@ -14,11 +14,12 @@ import numpy as np
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.conditions import jumps
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.corners import corners_of
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
-from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, ContactPair
 from dolfinx_nts.contact.shared_nodes import carried_area, check_shared
 from dolfinx_nts.contact.surface_pair import other_faces
 from dolfinx_nts.contact.valleys import valleys_of

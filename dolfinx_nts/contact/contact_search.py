@@ -15,12 +15,13 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.contact.apart import Apart
+from dolfinx_nts.contact.candidates import Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.held_slip import HeldSlip
 from dolfinx_nts.contact.left_behind import unheld
-from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.placed import Placed
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
 from dolfinx_nts.contact.valleys import tell_met

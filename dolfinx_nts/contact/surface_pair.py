@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import passages
+from dolfinx_nts.contact.candidates import MARGIN, Found, Motion
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
-from dolfinx_nts.contact.pair import MARGIN, Found, Motion
 from dolfinx_nts.contact.segments import near, segments
 from dolfinx_nts.contact.slave_points import OverMaster, SlavePoints, check_slave, sums_of
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.candidates import MARGIN, NO_CANDIDATES, Found, Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import INNER, middles
 from dolfinx_nts.contact.facet_pair import FacetPair
-from dolfinx_nts.contact.pair import MARGIN, NO_CANDIDATES, Found, Motion
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
