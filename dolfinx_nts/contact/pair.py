@@ -99,8 +99,8 @@ class ContactPair:
     of: ContactPair | None = None
     #: Of one that is added: whether its slave is on the contact's master.
     exchanged: ClassVar[bool] = False
-    #: Of one that is added: whether it is sought after others that are.
-    late: bool = False
+    #: Number of one that is added among those of its kind; they are sought in this order.
+    added: int = 0
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 
@@ -156,6 +156,8 @@ class ContactPair:
         self.edges, self.adjust = edges, float(adjust)
         # Searches reach farther by the largest gap that counts as none.
         self.offset, self.lift = np.zeros(len(slave.share)), 0.0
+        #: Facets to which gaps count as none from the start, or -1, shape (share,).
+        self.adjusted: IntArray = np.full(len(slave.share), -1)
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
@@ -281,6 +283,7 @@ class ContactPair:
         rounding = search.ROUNDING * (self.adjust + self.extent)
         near = np.abs(found.gap) <= self.adjust + rounding
         self.offset[found.node[near]] = found.gap[near]
+        self.adjusted[found.node[near]] = found.facet[near]
         largest = np.array([self.offset.max(initial=0.0)])
         self.lift = float(global_max(self.slave.body.comm, largest)[0])
 
@@ -398,6 +401,7 @@ class ContactPair:
     def is_like(self, other: ContactPair) -> bool:
         """Return whether both hold the same nodes, of bodies of equal names, out of one master."""
         alike = type(self) is type(other) and self.name == other.name
+        alike = alike and self.added == other.added
         same_nodes = alike and np.array_equal(self.slave.points, other.slave.points)
         return same_nodes and self.has_master_of(other)
 

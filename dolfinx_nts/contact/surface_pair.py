@@ -194,7 +194,7 @@ class OtherFaces(SurfacePair):
     of: SurfacePair
 
     def __init__(self, of: SurfacePair, face: int) -> None:
-        self.of, self.face = of, face
+        self.of, self.face, self.added = of, face, face - 1
         super().__init__(
             of.slave, of.master, friction=of.friction, interference=of.interference, name=of.name
         )
