@@ -194,7 +194,7 @@ def test_gaps_to_both_faces_are_adjusted(way):
 
 @pytest.mark.mpi
 def test_touches_stay_with_their_faces():
-    """A cube hits floor and wall and leaves the floor first: it touches the wall still, not anew."""
+    """A cube hits floor and wall and leaves the floor first: it touches the wall as before."""
 
     def thrown_in(masters):
         cube = nts.Continuum(
