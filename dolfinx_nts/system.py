@@ -14,12 +14,14 @@ import numpy as np
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.conditions import jumps
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.corners import corners_of
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
-from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, ContactPair
 from dolfinx_nts.contact.shared_nodes import carried_area, check_shared
+from dolfinx_nts.contact.surface_pair import other_faces
 from dolfinx_nts.contact.valleys import valleys_of
 from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels, together
@@ -119,7 +121,7 @@ class System:
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
         added = [
             (k, c) for k, pair in enumerate(self.contacts)
-            for c in (*corners_of(pair), *valleys_of(pair))
+            for c in (*corners_of(pair), *valleys_of(pair), *other_faces(pair))
         ]  # fmt: skip
         self.pairs = (*self.contacts, *(c for _, c in added))
         self.contact_of = [*range(len(self.contacts)), *(k for k, _ in added)]

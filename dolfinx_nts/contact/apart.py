@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from dolfinx_nts.contact.candidates import MARGIN
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Obstacle
-from dolfinx_nts.contact.pair import MARGIN, ContactPair
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.search import ROUNDING
 from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.kernels import facets

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution, Together
 from dolfinx_nts.contact.contact_measure import Attachment, Batch, ContactMeasure, Slip, fixed_of
-from dolfinx_nts.contact.pair import Candidates, ContactPair
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import entries_of, over

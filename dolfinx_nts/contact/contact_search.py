@@ -15,15 +15,16 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.contact.apart import Apart
+from dolfinx_nts.contact.candidates import Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.held_slip import HeldSlip
 from dolfinx_nts.contact.left_behind import unheld
-from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.placed import Placed
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
-from dolfinx_nts.contact.valleys import tell_met
+from dolfinx_nts.contact.valleys import bind, tell_met
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -66,10 +67,16 @@ class ContactSearch:
         self.idle_gaps: list[FloatArray] = []
         self._declared = sum(pair.of is None for pair in contacts)
         self._places, self._edges = Placed(contacts, bodies), edges
+        # What holds a contact's slave out of other faces.
+        self._beside: dict[int, list[int]] = {}
+        for k, pair in enumerate(contacts):
+            if pair.of and not pair.exchanged:
+                self._beside.setdefault(self._places.own[k], []).append(k)
         self.edges: dict[int, EdgeCoupling] = {}
         self._apart, self.held = Apart(contacts, bodies), HeldSlip(contacts, self._places)
         self._sought: list[int] = []
         self._cover, self._repeats = [0.0] * len(contacts), 0
+        self._raw: dict[int, Any] = {}
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._begun: State | None = None
@@ -135,21 +142,37 @@ class ContactSearch:
         had, declared = self.had_unknowns, [k for k in self._sought if k < self._declared]
         found: dict[int, Any] = self._search(declared)
         drop_doubles(found, self._old)
-        for late in (False, True):
+        added = self._sought[len(declared) :]
+        for number in sorted({self._pairs[k].added for k in added}):
             slaves: dict[int, list[ContactElements]] = {}
             for c in found.values():
                 slaves.setdefault(id(c.pair.slave.body), []).append(c)
-            added = [k for k in self._sought[len(declared) :] if self._pairs[k].late is late]
+            now = [k for k in added if self._pairs[k].added == number]
             together(self._comm, [
-                self._pairs[k].leave_to(slaves, self._edges.get(self._places.own[k])) for k in added
+                self._pairs[k].leave_to(slaves, self._edges.get(self._places.own[k])) for k in now
             ])  # fmt: skip
-            found |= self._search(added)
+            found |= self._search(now)
+        self._bind(found)
         tell_met(found, self._places.own)
         self.numbers, self._found = list(found), list(found.values())
         self._apart.found(self.numbers)
         self.bodies = [self._of[k] for k in found]
         self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in found.items()]
         self._had = None
+
+    def _bind(self, found: dict[int, Any]) -> None:
+        """Let nodes in inner edges stay with what has held them out of a face. Collective."""
+        for own, beside in self._beside.items():
+            each = [k for k in (own, *beside) if k in found]
+            if len(each) < 2 or not self._pairs[own].holds_nodes:
+                continue
+            raw, faces = [self._raw[k] for k in each], found[own].pair.convex.faces
+            before = [np.where(old.facet < 0, pair.adjusted, old.facet)
+                      for pair, old in ((self._pairs[k], self._old[k]) for k in each)]  # fmt: skip
+            new = bind(raw, before, faces)
+            if anywhere(self._comm, new is not None):
+                both = zip(each, new or raw, strict=True)
+                found |= {k: self._made(k, c) for k, c in both}
 
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""
@@ -229,11 +252,20 @@ class ContactSearch:
         )
         mine, share = ~self._foreign[k][found.node], pair.slave.share
         if k in self._edges:
-            beyond = yield from self._edges[k].find(positions, found, share[old.force > 0.0])
+            each = [self._old[i].force > 0.0 for i in (k, *self._beside.get(k, ()))]
+            carry = share[np.any(each, axis=0)]
+            beyond = yield from self._edges[k].find(positions, found, carry)
             mine &= ~np.isin(share[found.node], beyond)
         found = found.select(mine)
         if not (yield len(found.node) > 0):
             return None
+        self._raw[k] = found
+        return self._made(k, found)
+
+    def _made(self, k: int, found: Any) -> ContactElements:
+        """Elements of candidates of a contact. Collective."""
+        pair, path, bodies, step = self._pairs[k], self._paths[k], self._of[k], self._step
+        positions, old = self._positions(k), self._old[k]
         overlap, start = old.overlap[found.node], step.state.time
         ramp = step.integrator.ramp
         found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
@@ -304,14 +336,16 @@ class ContactSearch:
         """
         batches = dict(zip(self.numbers, range(len(parts)), strict=True))
         missed, passed = self._apart.misses(motion), list[Asking[bool]]()
+        held = {k: np.full(len(self._pairs[k].slave.share), -1) for k in self._sought}
+        for k, i in batches.items():
+            c, active = self.elements[i].candidates, parts[i].active
+            held[k][c.node[active]] = c.facet[active]
         for k in self._sought:
+            for i in held.keys() & self._beside.get(k, ()):
+                held[k] = np.where(held[k] < 0, held[i], held[k])
             reach = self._reach(k, motion)
             missed |= reach > self._cover[k]
-            held = np.full(len(self._pairs[k].slave.share), -1)
-            if k in batches:
-                c, active = self.elements[batches[k]].candidates, parts[batches[k]].active
-                held[c.node[active]] = c.facet[active]
-            passed.append(self._passed(k, e, held, reach))
+            passed.append(self._passed(k, e, held[k], reach))
         missed |= any(together(self._comm, passed))
         stale = not missed and self._are_stale(e, parts)
         self._repeats = self._repeats + 1 if stale else 0

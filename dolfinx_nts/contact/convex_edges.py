@@ -7,7 +7,11 @@ the facet on its other side.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.contact import passages
 from dolfinx_nts.kernels import compiled, facets, patches
@@ -40,6 +44,7 @@ class ConvexEdges:
         joined: As of `patches.neighbours`, without sharp edges.
         sharp: Which facets have a sharp edge, shape (m,).
         inner: Ends of the edges at which the master turns towards its slaves, shape (n, 2).
+        inner_facets: The two facets of each, shape (n, 2).
     """
 
     def __init__(self, at: IntArray, corners: FloatArray) -> None:
@@ -55,6 +60,7 @@ class ConvexEdges:
         meets = (rise > 0.0) & (cosine < INNER) & (one < two)
         ends = np.stack([at, np.roll(at, -1, axis=1)], axis=2)
         self.inner: IntArray = ends[one, edge][meets]
+        self.inner_facets = np.column_stack([one, two])[meets]
         self.sharp: BoolArray = ((self.beside >= 0) & (self.joined < 0)).any(axis=1)
 
     @property
@@ -62,6 +68,25 @@ class ConvexEdges:
         """Facets, those that they go on to, and over which of their edges, shape (n,) each."""
         one, edge = np.nonzero(self.joined >= 0)
         return one, self.joined[one, edge] // self.joined.shape[1], edge
+
+    @cached_property
+    def faces(self) -> IntArray:
+        """Number of each facet's face, shape (m,): faces that meet at an inner edge differ.
+
+        Others may have the same, so that there are few.
+        """
+        one, two, _ = self.smooth
+        size = len(self.sharp)
+        inner = np.isin(one * size + two, self.inner_facets @ [size, 1])
+        inner |= np.isin(two * size + one, self.inner_facets @ [size, 1])
+        one, two = one[~inner], two[~inner]
+        joined = coo_array((np.ones(len(one)), (one, two)), shape=(size, size))
+        count, face = connected_components(joined, directed=False)
+        number, meet = np.full(count, -1), face[self.inner_facets]
+        for k in np.unique(meet):
+            beside = meet[(meet == k).any(axis=1)]
+            number[k] = np.setdiff1d(np.arange(len(beside) + 1), number[beside[beside != k]])[0]
+        return np.maximum(number, 0)[face]
 
     def across(
         self,

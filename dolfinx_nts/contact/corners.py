@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.candidates import Found, Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import OUTSIDE
 from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.facet_pair import FacetPair
-from dolfinx_nts.contact.pair import Found, Motion
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.parallel import Asking, global_sum

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.candidates import MARGIN, Candidates
 from dolfinx_nts.contact.edge_contact import EdgeAttachment, EdgeContact, EdgeElements
 from dolfinx_nts.contact.edges import LEVEL, SHARES, Near, Pairs
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.making import elements_of
-from dolfinx_nts.contact.pair import MARGIN, Candidates
 from dolfinx_nts.contact.surfaces import gather_each
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step

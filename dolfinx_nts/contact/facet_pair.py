@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import passages, search
+from dolfinx_nts.contact.candidates import MARGIN, NO_CANDIDATES, Candidates, Found, Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import OUTSIDE, middles
 from dolfinx_nts.contact.edges import Edges
@@ -17,14 +18,7 @@ from dolfinx_nts.contact.facing import Facing
 from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.normal_cones import NormalCones
-from dolfinx_nts.contact.pair import (
-    MARGIN,
-    NO_CANDIDATES,
-    Candidates,
-    ContactPair,
-    Found,
-    Motion,
-)
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.rims import Rims
 from dolfinx_nts.contact.slave_paths import SlavePaths
 from dolfinx_nts.contact.surfaces import Surface

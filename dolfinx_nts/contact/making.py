@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import ContactLaw
 from dolfinx_nts.contact.contact_measure import Attachment, ContactMeasure, fixed_of
-from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.contact.slip_friction import SlipFriction
 from dolfinx_nts.interaction.elements import Step

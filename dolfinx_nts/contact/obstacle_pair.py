@@ -6,19 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dolfinx_nts.contact.candidates import MARGIN, Candidates, Found, Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.obstacles import Obstacle
-from dolfinx_nts.contact.pair import (
-    INITIAL_PENETRATION,
-    MARGIN,
-    Candidates,
-    ContactPair,
-    Found,
-    Motion,
-)
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import Asking, global_max, together
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.contact.candidates import MARGIN, Found, Motion
 from dolfinx_nts.contact.edges import LEVEL
 from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Obstacle, inverse
-from dolfinx_nts.contact.pair import MARGIN, Found, Motion
 from dolfinx_nts.contact.segments import FACING
 from dolfinx_nts.contact.slave_points import OverMaster, SlavePoints, check_slave, sums_of
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.candidates import MARGIN, Candidates, Found, Motion
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.slip_friction import at_rest
 from dolfinx_nts.contact.surfaces import Surface, gather_each
@@ -28,80 +29,12 @@ from dolfinx_nts.validation import (
     require_one_of,
 )
 
-#: Candidates are sought this part of a facet beyond the reach of the step's motion.
-MARGIN = 0.5
 #: Part of a facet's size by which a slave may penetrate at the start of a run.
 INITIAL_PENETRATION = 0.01
 #: The same of an equilibrium, by what is asked for at overlap; deeper nodes are no candidates.
 INTERFERENCE = {"refuse": INITIAL_PENETRATION, "resolve": MARGIN}
 #: What `ContactPair(integration=...)` may be.
 INTEGRATIONS = ("nodes", "surface")
-
-
-class Candidates(NamedTuple):
-    """Slave nodes that may touch in a step, one facet each; axis 0 = pair.
-
-    Attributes:
-        node: Positions in the slave surface's `share`, shape (n,).
-        facet: Facets of the master surface, shape (n,).
-        patch: What lies over them there, as of `Surface.patch_at`, shape (n,).
-        xi: Orthogonal projection at t_n, shape (n, 2).
-        normal: Outward unit normal of the master there, shape (n, 3).
-        gap: g_0 [m], shape (n,).
-        length: Size of the facet [m], shape (n,).
-    """
-
-    node: IntArray
-    facet: IntArray
-    patch: IntArray
-    xi: FloatArray
-    normal: FloatArray
-    gap: FloatArray
-    length: FloatArray
-
-    def select(self, chosen: IntArray | BoolArray) -> Candidates:
-        """Return some of the candidates, by number or by a mask."""
-        return Candidates._make(a[chosen] for a in self)
-
-
-NO_CANDIDATES = Candidates(
-    np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64),
-    np.empty((0, 2)), np.empty((0, 3)), np.empty(0), np.empty(0),
-)  # fmt: skip
-
-
-class Motion(NamedTuple):
-    """How slaves and masters are expected to move in a step.
-
-    Attributes:
-        reach: Bound on the motion of slaves relative to the master [m].
-        paths: Displacement of each of a pair's bodies over the step [m], owned coordinates.
-        aimed: Facet that a path of an earlier attempt at the step met, or -1, of each of the rank's
-            slave nodes.
-        solved: Whether the paths are those of a solution, whose end is to be in equilibrium.
-        at_rest: Whether it is a load step, which may be of any length and lead elsewhere.
-    """
-
-    reach: float
-    paths: Sequence[FloatArray]
-    aimed: IntArray
-    solved: bool = False
-    at_rest: bool = False
-
-
-class Found(NamedTuple):
-    """What a search found.
-
-    Attributes:
-        candidates: Slave nodes that may touch.
-        followed: Which of the rank's slave nodes are known not to have passed by the surface's
-            edge, shape (share,).
-        cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
-    """
-
-    candidates: Candidates
-    followed: BoolArray
-    cover: float
 
 
 @known_options
@@ -166,8 +99,8 @@ class ContactPair:
     of: ContactPair | None = None
     #: Of one that is added: whether its slave is on the contact's master.
     exchanged: ClassVar[bool] = False
-    #: Of one that is added: whether it is sought after others that are.
-    late: bool = False
+    #: Number of one that is added among those of its kind; they are sought in this order.
+    added: int = 0
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 
@@ -223,6 +156,8 @@ class ContactPair:
         self.edges, self.adjust = edges, float(adjust)
         # Searches reach farther by the largest gap that counts as none.
         self.offset, self.lift = np.zeros(len(slave.share)), 0.0
+        #: Facets to which gaps count as none from the start, or -1, shape (share,).
+        self.adjusted: IntArray = np.full(len(slave.share), -1)
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
@@ -348,6 +283,7 @@ class ContactPair:
         rounding = search.ROUNDING * (self.adjust + self.extent)
         near = np.abs(found.gap) <= self.adjust + rounding
         self.offset[found.node[near]] = found.gap[near]
+        self.adjusted[found.node[near]] = found.facet[near]
         largest = np.array([self.offset.max(initial=0.0)])
         self.lift = float(global_max(self.slave.body.comm, largest)[0])
 
@@ -465,6 +401,7 @@ class ContactPair:
     def is_like(self, other: ContactPair) -> bool:
         """Return whether both hold the same nodes, of bodies of equal names, out of one master."""
         alike = type(self) is type(other) and self.name == other.name
+        alike = alike and self.added == other.added
         same_nodes = alike and np.array_equal(self.slave.points, other.slave.points)
         return same_nodes and self.has_master_of(other)
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.edges import Edges
 from dolfinx_nts.contact.normal_cones import LETS_IN
-from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray

@@ -11,9 +11,10 @@ from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.along_surface import Neighbourhoods
+from dolfinx_nts.contact.candidates import Candidates, Found, Motion
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.facing import opposite
-from dolfinx_nts.contact.pair import INITIAL_PENETRATION, Candidates, Found, Motion
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.kernels.vectors import cross

@@ -129,8 +129,14 @@ def _of_one_body(contacts: Mapping[int, ContactPair]) -> list[tuple[int, int]]:
 
 
 def _beside(contacts: Sequence[ContactPair]) -> Iterator[tuple[int, int, str]]:
-    """Pairs of contacts that share slave nodes and a master, in order, and what the master is."""
-    for i, j in _of_one_body(dict(enumerate(contacts))):
+    """Pairs of contacts that share slave nodes and a master, in order, and what the master is.
+
+    What is added to a contact stands beside it, but for corners, which come last.
+    """
+    number = {id(pair): k for k, pair in enumerate(contacts)}
+    place = [(pair.exchanged, number[id(pair.of or pair)]) for pair in contacts]
+    for both in _of_one_body(dict(enumerate(contacts))):
+        i, j = sorted(both, key=place.__getitem__)
         one, two = contacts[i], contacts[j]
         what: Any = one.shares_master(two)
         # What is added to a contact holds its nodes out of other facets.

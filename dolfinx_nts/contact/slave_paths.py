@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import passages, search
+from dolfinx_nts.contact.candidates import MARGIN, Candidates, Motion
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE
 from dolfinx_nts.contact.normal_cones import LETS_IN
-from dolfinx_nts.contact.pair import MARGIN, Candidates, Motion
 from dolfinx_nts.contact.surfaces import gather_each
 from dolfinx_nts.kernels import compiled, facets, nts_element
 from dolfinx_nts.parallel import Asking, raise_together

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
 from dolfinx_nts.contact.contact_measure import Measured, Slip
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.obstacle_gap import ObstacleGap
-from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
 from dolfinx_nts.interaction.combination import Combination

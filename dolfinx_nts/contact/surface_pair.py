@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.contact import passages
+from dolfinx_nts.contact.candidates import MARGIN, Found, Motion
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
-from dolfinx_nts.contact.pair import MARGIN, Found, Motion
 from dolfinx_nts.contact.segments import near, segments
 from dolfinx_nts.contact.slave_points import OverMaster, SlavePoints, check_slave, sums_of
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements
@@ -29,6 +30,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
     """A `FacetPair` that keeps the slave's surface out in the mean around each node."""
 
     holds_nodes = False
+    #: Number of the master's faces that hold it, see `ConvexEdges.faces`.
+    face = 0
 
     def _set_up(self) -> None:
         super()._set_up()
@@ -81,7 +84,9 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """
         slaves, master = positions
         own, other = slaves[self.slave.facets[self._own.facets]], master[self.master.facets]
-        pairs = near(own, other, radius)
+        one, two = near(own, other, radius)
+        mine = self.convex.faces[two] == self.face
+        pairs = one[mine], two[mine]
         if not len(pairs[0]):
             return self._own.none
         found = segments(own, other, pairs)
@@ -116,6 +121,11 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         length = facets.size(master[self.master.facets])[points.other]
         found = points._replace(xi=xi, normal=normal, gap=gap, length=length)
         return found.select(converged)
+
+    def stops(self, node: IntArray, master: FloatArray) -> passages.Stops | None:
+        """As of `FacetPair`: those of its faces."""
+        faces = self.convex.faces
+        return (lambda _, facet: faces[facet] == self.face) if faces.any() else None
 
     def elements(
         self, found: Any, positions: Sequence[FloatArray], path: FloatArray, step: Step
@@ -168,3 +178,32 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         comm = self.slave.body.comm
         raise_together(comm, text, lambda told: StepFailedError(told, advises=True))
         return None
+
+
+class OtherFaces(SurfacePair):
+    """Faces of a pair's master beyond inner edges, with multipliers of their own.
+
+    Around a node of the slave in such an edge no mean of the gaps to both faces keeps it out of
+    either.
+
+    Args:
+        of: The pair, whose options it has.
+        face: Number of the faces.
+    """
+
+    of: SurfacePair
+
+    def __init__(self, of: SurfacePair, face: int) -> None:
+        self.of, self.face, self.added = of, face, face - 1
+        super().__init__(
+            of.slave, of.master, friction=of.friction, interference=of.interference, name=of.name
+        )
+        # Points are where they are for the pair.
+        self.origin, self.extent = of.origin, of.extent
+
+
+def other_faces(pair: Any) -> list[OtherFaces]:
+    """What holds the slave of a pair out of faces beyond inner edges of its master."""
+    if type(pair) is not SurfacePair:
+        return []
+    return [OtherFaces(pair, k) for k in range(1, 1 + int(pair.convex.faces.max(initial=0)))]

@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from dolfinx_nts.contact import search
+from dolfinx_nts.contact.candidates import MARGIN, NO_CANDIDATES, Candidates, Found, Motion
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import INNER, middles
 from dolfinx_nts.contact.facet_pair import FacetPair
-from dolfinx_nts.contact.pair import MARGIN, NO_CANDIDATES, Found, Motion
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.parallel import Asking
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -37,11 +38,9 @@ class Valleys(FacetPair):
         self.of, self._before = of, (of, *before)
         super().__init__(
             of.slave, of.master, friction=of.friction_function or of.friction,
-            interference=of.interference, name=of.name,
+            interference=of.interference, adjust=of.adjust, name=of.name,
         )  # fmt: skip
-        # Points are where they are for the pair.
-        self.origin, self.extent = of.origin, of.extent
-        self.late = bool(before)
+        self.added = len(before)
         self._first: IntArray = np.full((len(self._before), len(self.slave.share)), -1)
 
     @cached_property
@@ -68,14 +67,28 @@ class Valleys(FacetPair):
         followed: BoolArray | None = None,
     ) -> Asking[Found]:
         """As of `ContactPair`: at the nearest facet across from the others."""
-        slaves, master = positions
-        corners, inner = master[self.master.facets], self._inner
-        reach = 0.0 if motion is None else motion.reach
-        every, sizes = np.ones(len(self.slave.share), dtype=bool), facets.size(corners[inner])
-        cover = reach + MARGIN * float(sizes.min())
-        node = np.flatnonzero((self._first >= 0).all(axis=0))
-        if not (yield node.size > 0):
+        reach = self.lift + (0.0 if motion is None else motion.reach)
+        sizes = facets.size(positions[1][self.master.facets[self._inner]])
+        every = np.ones(len(self.slave.share), dtype=bool)
+        cover = reach - self.lift + MARGIN * float(sizes.min())
+        if not (yield bool((self._first >= 0).all(axis=0).any())):
             return Found(NO_CANDIDATES, every, cover)
+        c, _ = self._across(positions, current, reach, MARGIN * float(sizes.max()))
+        return Found(c._replace(gap=c.gap - self.offset[c.node]), every, cover)
+
+    def _across(
+        self, positions: Sequence[FloatArray], current: IntArray, reach: float, margin: float
+    ) -> tuple[Candidates, FloatArray]:
+        """Nodes at the nearest facets across from those of `_first`, and their distances [m].
+
+        Args:
+            positions: As of `find`.
+            current: As of `find`.
+            reach: Largest gap [m], ...
+            margin: ... and how far beyond it facets are looked at.
+        """
+        (slaves, master), inner = positions, self._inner
+        corners, node = master[self.master.facets], np.flatnonzero((self._first >= 0).all(axis=0))
         x, (place, normal) = slaves[self.slave.share], middles(corners)
 
         def across(point: IntArray, facet: IntArray) -> BoolArray:
@@ -91,15 +104,26 @@ class Valleys(FacetPair):
         number[inner] = np.arange(len(inner))
         stays = number[current[node]]
         stays[~across(np.arange(len(node)), stays)] = -1
-        found = search.closest_facets(
-            x[node], corners[inner], reach=reach + MARGIN * float(sizes.max()),
-            current=stays, admits=search.Admits(across),
+        closest = search.closest_facets(
+            x[node], corners[inner], reach=reach + margin, current=stays,
+            admits=search.Admits(across),
         )  # fmt: skip
-        near = found.facet >= 0
-        candidates, _ = self.measure(
-            x, master, node[near], inner[found.facet[near]], found.xi[near], reach
-        )
-        return Found(candidates, every, cover)
+        near = closest.facet >= 0
+        facet, xi = inner[closest.facet[near]], closest.xi[near]
+        found, _ = self.measure(x, master, node[near], facet, xi, reach)
+        away = np.full(len(x), np.inf)
+        away[node[near]] = closest.distance[near]
+        return found, away[found.node]
+
+    def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
+        """As of `ContactPair`."""
+        self._first[:] = -1
+        for first, pair in zip(self._first, self._before, strict=True):
+            c = pair._at_start(positions, path)
+            first[c.node] = c.facet
+        none = np.full(len(self.slave.share), -1)
+        found, away = self._across(positions, none, self.adjust, 0.0)
+        return found.select(away <= self.adjust)
 
     def missed(
         self,
@@ -114,8 +138,38 @@ class Valleys(FacetPair):
         yield from ()
         return None
 
-    def settle(self, u: Sequence[FloatArray]) -> None:
-        """Nothing is adjusted but the gap to the facet that holds a node in its pair."""
+
+def bind(
+    found: Sequence[Candidates], before: Sequence[IntArray], faces: IntArray
+) -> list[Candidates] | None:
+    """Let nodes in inner edges stay with what has held them out of a face, or None if they do.
+
+    Which face is nearer changes from step to step; what is remembered of a face is of its pair.
+
+    Args:
+        found: Candidates of a contact and of what is added to it for other faces.
+        before: Facets that each had in the last step, or -1, shape (share,).
+        faces: Of the facets, see `ConvexEdges.faces`.
+    """
+    shape = len(found), len(before[0])
+    row, have, had = np.full(shape, -1), np.full(shape, -1), np.full(shape, -2)
+    start = np.cumsum([0, *(len(c.node) for c in found)])
+    for k, c in enumerate(found):
+        row[k, c.node], have[k, c.node] = start[k] + np.arange(len(c.node)), faces[c.facet]
+        known = before[k] >= 0
+        had[k, known] = faces[before[k][known]]
+    order = row.copy()
+    for i, j in combinations(range(len(found)), 2):
+        stay = (have[i] == had[i]) + 1 * (have[j] == had[j])
+        swap = (have[j] == had[i]) + 1 * (have[i] == had[j]) > stay
+        for both in (order, have):
+            both[i, swap], both[j, swap] = both[j, swap], both[i, swap]
+    if (order == row).all():
+        return None
+    every = Candidates._make(np.concatenate(parts) for parts in zip(*found, strict=True))
+    return [
+        every.select(rows[rows >= 0])._replace(node=np.flatnonzero(rows >= 0)) for rows in order
+    ]
 
 
 def tell_met(found: dict[int, ContactElements], own: Sequence[int]) -> None:
@@ -125,12 +179,13 @@ def tell_met(found: dict[int, ContactElements], own: Sequence[int]) -> None:
         found: Candidates of contacts by their number, which are replaced.
         own: Of each contact its number, or that of the one that it is added to.
     """
-    for k, valley in list(found.items()):
-        if not isinstance(valley.pair, Valleys) or valley.pair.redundant:
+    for k, more in list(found.items()):
+        pair = more.pair
+        if pair.of is None or pair.exchanged or pair.redundant or own[k] not in found:
             continue
-        for i in {own[k], k}:
-            meets = np.isin(found[i].candidates.node, valley.candidates.node)
-            law = found[i].law
+        both = np.intersect1d(found[own[k]].candidates.node, more.candidates.node)
+        for i in (own[k], k):
+            meets, law = np.isin(found[i].candidates.node, both), found[i].law
             found[i] = replace(found[i], law=replace(law, meets=law.meets | meets))
 
 

@@ -69,10 +69,12 @@ class ContactLoads(NamedTuple):
             k: Number of the contact.
             force: Those of its law, shape (share,).
         """
-        # Surfaces that are integrated over have neither corners nor others of their kind.
-        found = next((c.pressing(part) for c, part in self.elements.get(k, ())), None)
-        if found is None:
+        # Surfaces that are integrated over have no corners, but several faces may hold them.
+        parts = [c.pressing(part) for c, part in self.elements.get(k, ())]
+        over = [part for part in parts if part is not None]
+        if not over:
             return force
+        found: FloatArray = np.sum(over, axis=0)
         slave = self.contacts[k].slave
         slave.body.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.SUM)
         return found[slave.share] / self.factor

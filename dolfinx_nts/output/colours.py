@@ -100,7 +100,8 @@ def _pressure(body: Body, run: Any) -> FloatArray:
     index_map = body.space.dofmap.index_map
     total = np.full(index_map.size_local, np.nan)
     # During a run the mean of two steps, as those of single ones alternate.
-    force = getattr(run, "mean_force", lambda k: run.state.contacts[k].force)
+    histories = run.system.of_slaves(run.state.contacts)
+    force = getattr(run, "mean_force", lambda k: histories[k].force)
     for k, pair in enumerate(run.system.contacts):
         if pair.slave.body is body:
             pressure = pressures(pair.slave, force(k), run.system.slave_area(k, run.state))

@@ -169,10 +169,7 @@ class LedgerCheck:
                 "use a smaller dt",
                 grave=True,
             )  # fmt: skip
-        remedy = (
-            "use a finer or smoother master, or a smaller, constant dt; where faces of the master "
-            "meet at an inner edge, declare a contact for each"
-        )
+        remedy = "use a finer or smoother master, or a smaller, constant dt"
         nodes = bool(self._solution.system.contacts)
         now = row["massless_defect"] - before["massless_defect"] - gain
         if now > self._jerk[0]:

@@ -349,8 +349,14 @@ class Stepper:
         Returns:
             At this rank's slave nodes, as in `state.contacts`.
         """
-        mean = self._last_steps.mean_force(k)
-        return self.state.contacts[k].force if mean is None else mean
+        means = [
+            self._last_steps.mean_force(n) for n, pair in enumerate(self.system.pairs)
+            if self.system.contact_of[n] == k and not pair.exchanged
+        ]  # fmt: skip
+        known = [mean for mean in means if mean is not None]
+        if not known:
+            return self.system.of_slaves(self.state.contacts)[k].force
+        return sum(known[1:], start=known[0])
 
     def jumps_at_start(self, dt: float) -> str:
         """What a failure in the first steps, of dt [s], may come of, see `jumps`. Collective."""

@@ -19,8 +19,9 @@ from dolfinx_nts.types import FloatArray
 #: heap most steps settle by the fifth, and those that do not hardly ever do later.
 _CLEAR = 4
 #: The first width, over the largest of the lengths by which nodes that do not settle miss their
-#: laws, forces over the masses that they move.
-_FIRST = 0.1
+#: laws, forces over the masses that they move; and over the last width, as what they miss may be
+#: rounding.
+_FIRST, _LEAST = 0.1, 100.0
 #: A blurred law counts as solved where rows miss less than this part of widths and bounds; ...
 _NEAR = 0.8
 #: ... the next one's width is this part of its width.
@@ -165,8 +166,9 @@ class BlurredContacts:
             largest = max(largest, float(rows[changes].max(initial=0.0)))
             least = min(least, float(batch.law.still.min(initial=np.inf)))
         sizes = global_max(self._problem.system.comm, np.array([largest, -least]))
-        self._width, self._last = _FIRST * float(sizes[0]), -float(sizes[1])
-        self.blurs, self._tries = 0.0 < self._width < np.inf, 0
+        missed, self._last = float(sizes[0]), -float(sizes[1])
+        self._width = max(_FIRST * missed, _LEAST * self._last)
+        self.blurs, self._tries = 0.0 < missed < np.inf and self._width < np.inf, 0
         self._sharp = _PARTED * self._width
         self._problem.shared_weight.kept |= self.blurs
         return self.blurs
@@ -205,7 +207,8 @@ class BlurredContacts:
         worst, wide = 0.0, self._width > self._sharp
         for batch, part in zip(batches, parts, strict=True):
             law, force = batch.law, -part.end[:, 0]
-            rows = batch.law_rows(part) / law.scale[:, None]
+            with np.errstate(over="ignore", invalid="ignore"):
+                rows = batch.law_rows(part) / law.scale[:, None]
             pull = law.yielding * rows[:, 0]
             on = np.full(len(force), True) if wide else part.active
             worst = max(worst, float(np.abs(rows[on, 0]).max(initial=0.0)) / self._width)

@@ -81,7 +81,7 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
     # Nodes that carry and that stick, Coulomb's bound, friction, what else holds along each axis.
     local, rubs = np.zeros((len(system.bodies), 9)), set[tuple[int, str]]()
     both = zip(problem.couplings.touching(e), problem.couplings.bodies, strict=False)
-    for (k, contact, part, old), of in both:
+    for (_, contact, part, old), of in both:
         bodies = list(of)
         if not contact.law.num_tangential:  # may hold the body against sliding, as a wall does
             local[bodies, 6:] += part.active.sum()
@@ -90,7 +90,7 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
         local[bodies, 1] += (part.active & contact.law.sticks(part)).sum()
         local[bodies, 2] += contact.law.coefficient * old.force.sum()
         # Of corners that of their slaves is opposite to that of the contact's.
-        side = 1.0 if k < len(system.contacts) else -1.0
+        side = -1.0 if contact.pair.exchanged else 1.0
         local[bodies, 3:6] += side * old.tangential.sum(axis=0)
         if part.active.any() or old.force.any():
             rubs |= {(body, contact.name) for body in bodies}

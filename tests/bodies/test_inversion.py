@@ -143,6 +143,13 @@ def test_edge_nodes_of_degree_two():
     assert place[0] == pytest.approx(0.75)
 
 
+def test_what_is_not_finite_counts_as_inside_out():
+    body = cube(2, comm=MPI.COMM_SELF)
+    u = np.zeros(body.num_owned)
+    u[5] = np.nan
+    assert body.smallest_det(u)[0] == -np.inf
+
+
 def test_bodies_without_cells_have_none():
     system = nts.System([PointMass(COMM, 1.0, np.zeros(3), np.ones(3))])
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=2e-2)

@@ -13,11 +13,11 @@ from dolfinx.mesh import CellType, create_box
 from measures import STENCIL
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact.candidates import Candidates
 from dolfinx_nts.contact.edge_contact import EdgeAttachment
 from dolfinx_nts.contact.edges import SHARES
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.making import elements_of
-from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.interaction.elements import evaluate_together
 from dolfinx_nts.kernels import compiled, facets
 

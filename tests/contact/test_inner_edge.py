@@ -12,6 +12,8 @@ from scenes import RUBBER, at, box, everywhere
 import dolfinx_nts as nts
 from dolfinx_nts.contact.convex_edges import ConvexEdges
 
+over = pytest.mark.parametrize("integration", ["nodes", "surface"])
+
 
 @pytest.mark.parametrize(("n", "count"), [(16, 0), (7, 7)])
 @pytest.mark.parametrize("outwards", [False, True])
@@ -22,9 +24,14 @@ def test_a_bore_of_many_facets_has_no_inner_edges(n, count, outwards):
     y, k = np.concatenate([ring, ring + [0, 0, 1]]), np.arange(n)
     facets = np.stack([k, k + n, (k + 1) % n + n, (k + 1) % n], axis=1)
     at = facets[:, ::-1] if outwards else facets
-    inner = ConvexEdges(at, y[at]).inner
+    edges = ConvexEdges(at, y[at])
+    inner = edges.inner
     assert len(inner) == (0 if outwards else count)
-    assert (np.sort(inner % n, axis=1)[:, 0] == np.sort(inner % n, axis=1)[:, 1]).all()
+    assert (inner[:, 0] % n == inner[:, 1] % n).all()
+    # Faces beside each other differ: of seven around three kinds do.
+    assert len(np.unique(edges.faces)) == (3 if len(inner) else 1)
+    one, two = edges.faces[edges.inner_facets].T
+    assert (one != two).all()
 
 
 def room():
@@ -39,21 +46,37 @@ def room():
     )  # fmt: skip
 
 
-def pressed(masters):
-    """Equilibrium of a rubber cube that its weight presses into the edge, and its energy [J]."""
-    cube = nts.Continuum(
-        box([0.5, 0.2, 0], [1, 0.7, 0.5]), RUBBER, density=1e3, name="cube",
+PLANES = [nts.Plane((0, 0, 0), (0, 0, 1)), nts.Plane((1, 0, 0), (-1, 0, 0), name="wall")]
+LEANS = (5, 0, -9.81)
+
+
+def BOTH(x):  # noqa: N802
+    """Floor and wall of the room."""
+    return (at(2, 0.0)(x) & (x[0] < 1.1)) | at(0, 1.0)(x)
+
+
+def leaning(way=(0.0, 0.0)):
+    """A rubber cube in the edge of the room, or off it."""
+    dx, dz = way
+    return nts.Continuum(
+        box([0.5 + dx, 0.2, dz], [1 + dx, 0.7, 0.5 + dz]), RUBBER, density=1e3, name="cube",
         bcs=[nts.Dirichlet(at(1, 0.2), components=(1,))],
     )  # fmt: skip
-    body, surfaces = masters()
-    pairs = [nts.ContactPair(cube.surface(everywhere), s) for s in surfaces]
-    system = nts.System([cube, *body], contacts=pairs, gravity=(5, 0, -9.81))
+
+
+def pressed(masters, integration):
+    """Equilibrium of a rubber cube that its weight presses into the edge, and its energy [J]."""
+    cube, (body, surfaces) = leaning(), masters()
+    own = cube.surface(everywhere)
+    pairs = [nts.ContactPair(own, s, integration=integration) for s in surfaces]
+    system = nts.System([cube, *body], contacts=pairs, gravity=LEANS)
     run = nts.equilibrium(system, load_steps=2)
     return run, run.balance["potential"][-1]
 
 
 @pytest.mark.mpi
-def test_a_cube_in_the_edge_of_a_room():
+@over
+def test_a_cube_in_the_edge_of_a_room(integration):
     """With one contact for both faces it is held as with a contact for each, or by two planes.
 
     Held out of one of them alone, its edge passed through the other; it stored a tenth too much.
@@ -61,19 +84,15 @@ def test_a_cube_in_the_edge_of_a_room():
 
     def whole():
         body = room()
-        floor, wall = at(2, 0.0), at(0, 1.0)
-        return [body], [body.surface(lambda x: (floor(x) & (x[0] < 1.1)) | (wall(x)))]
+        return [body], [body.surface(BOTH)]
 
     def each():
         body = room()
         return [body], [body.surface(at(2, 0.0)), body.surface(at(0, 1.0))]
 
-    def planes():
-        return [], [nts.Plane((0, 0, 0), (0, 0, 1)), nts.Plane((1, 0, 0), (-1, 0, 0), name="wall")]
-
-    _, right = pressed(planes)
+    _, right = pressed(lambda: ([], PLANES), integration)
     for masters in (each, whole):
-        run, energy = pressed(masters)
+        run, energy = pressed(masters, integration)
         assert run.status == "completed" and energy == pytest.approx(right, rel=1e-9)
     weight = 1e3 * 0.5**3 * np.array([5.0, 0.0, -9.81])
     assert np.allclose(run.contact_forces[-1, 0], -weight, atol=1e-9 * np.abs(weight).max())
@@ -90,10 +109,10 @@ def sum_of(field, comm):
 
 
 @pytest.mark.mpi
+@over
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_overlap_with_both_faces_is_pressed_out(friction):
+def test_overlap_with_both_faces_is_pressed_out(friction, integration):
     """A cube held on its far sides that starts in floor and wall: as with a contact for each."""
-    floor, wall = at(2, 0.0), at(0, 1.0)
 
     def fitted(masters):
         held = [(1, at(1, 0.2)), (0, at(0, 0.51)), (2, at(2, 0.495))]
@@ -104,14 +123,14 @@ def test_overlap_with_both_faces_is_pressed_out(friction):
         body = room()
         pairs = [
             nts.ContactPair(
-                cube.surface(everywhere), body.surface(m), interference="resolve", friction=friction
+                cube.surface(everywhere), body.surface(m), interference="resolve",
+                friction=friction, integration=integration,
             )
             for m in masters
-        ]
+        ]  # fmt: skip
         return nts.equilibrium(nts.System([cube, body], contacts=pairs), load_steps=2)
 
-    one = fitted([lambda x: (floor(x) & (x[0] < 1.1)) | wall(x)])
-    each = fitted([floor, wall])
+    one, each = fitted([BOTH]), fitted([at(2, 0.0), at(0, 1.0)])
     assert one.status == each.status == "completed"
     for name in ("potential", "interference_work", "friction_dissipation"):
         assert one.balance[name] == pytest.approx(each.balance[name], rel=1e-9), name
@@ -147,13 +166,97 @@ def test_a_bar_slides_down_a_v_groove():
     assert bar.velocity == pytest.approx([speed, 0.0, 0.0], abs=1e-8 * speed)
 
 
+@pytest.mark.mpi
+def test_a_row_that_two_contacts_share_is_held_out_of_both_faces():
+    """A contact for the cube's bottom and one for its side, each with the whole room as master."""
+    _, right = pressed(lambda: ([], PLANES), "nodes")
+    cube, body = leaning(), room()
+    pairs = [
+        nts.ContactPair(cube.surface(side), body.surface(BOTH)) for side in (at(2, 0.0), at(0, 1.0))
+    ]
+    system = nts.System([cube, body], contacts=pairs, gravity=LEANS)
+    run = nts.equilibrium(system, load_steps=2)
+    assert run.status == "completed"
+    assert run.balance["potential"][-1] == pytest.approx(right, rel=1e-9)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("way", [(-0.002, 0.004), (0.002, -0.004), (0.004, -0.002)])
+def test_gaps_to_both_faces_are_adjusted(way):
+    """A cube off, or inside, floor and wall by millimetres settles as if it touched both."""
+    _, right = pressed(lambda: ([], PLANES), "nodes")
+    cube, body = leaning(way), room()
+    pair = nts.ContactPair(cube.surface(everywhere), body.surface(BOTH), adjust=0.01)
+    run = nts.equilibrium(nts.System([cube, body], contacts=[pair], gravity=LEANS), load_steps=2)
+    assert run.status == "completed"
+    assert run.balance["potential"][-1] == pytest.approx(right, rel=1e-9)
+
+
+@pytest.mark.mpi
+def test_touches_stay_with_their_faces():
+    """A cube hits floor and wall and leaves the floor first: it touches the wall as before."""
+
+    def thrown_in(masters):
+        cube = nts.Continuum(
+            box([0.5, 0.2, 0], [1, 0.7, 0.5]), nts.NeoHookean(young=1e6, poisson=0.3), density=1e3,
+            velocity=(1, 0, -1), name="cube",
+        )  # fmt: skip
+        body = room()
+        pairs = [nts.ContactPair(cube.surface(everywhere), body.surface(m)) for m in masters]
+        system = nts.System([cube, body], contacts=pairs, gravity=(0, 0, -9.81))
+        run = nts.simulate(
+            system, nts.EnergyMomentum(), dt=1e-3, t_end=0.015, impact="restored", accuracy="exact"
+        )
+        return run.state.u[0], run.balance["impact_restored"]
+
+    one, each = thrown_in([BOTH]), thrown_in([at(2, 0.0), at(0, 1.0)])
+    for found, expected in zip(one, each, strict=True):
+        size = np.abs(expected).max(initial=0.0)
+        assert np.abs(found - expected).max(initial=0.0) <= 1e-9 * size
+
+
+@pytest.mark.mpi
+def test_a_run_goes_on_with_the_forces_of_all_faces():
+    """From an equilibrium in a corner of three faces, in another system of the same bodies."""
+
+    def resting():
+        cube = nts.Continuum(
+            box([0, 0, 0], [0.5] * 3, [2] * 3), RUBBER, density=1e3, name="cube"
+        )  # fmt: skip
+        corner = rigid_corner()
+        pair = nts.ContactPair(cube.surface(everywhere), corner.surface(within))
+        return nts.System([cube, corner], contacts=[pair], gravity=(-3, -4, -9.81))
+
+    rests = nts.equilibrium(resting(), load_steps=2)
+    run = nts.simulate(resting(), nts.EnergyMomentum(), dt=1e-3, t_end=2e-3, start=rests,
+                       start_time=0.0)  # fmt: skip
+    assert np.ptp(run.balance["active"]) == 0.0
+    force, weight = run.contact_forces[-1, 0], 1e3 * 0.5**3 * np.array([3, 4, 9.81])
+    assert force == pytest.approx(weight, rel=1e-6)
+
+
 def within(x):
     """On the inner faces of the corner."""
     zero = np.abs(x) < 1e-9
     return zero.any(axis=0) & (x > -1e-9).all(axis=0)
 
 
-def thrown(masters, friction=0.0, t_end=0.12, **soft):
+def drawn_corner():
+    """Three faces that meet, of Gmsh's tetrahedra."""
+
+    def draw(occ):
+        whole, hole = occ.addBox(-0.4, -0.4, -0.4, 2.4, 2.4, 2.4), occ.addBox(0, 0, 0, 3, 3, 3)
+        return occ.cut([(3, whole)], [(3, hole)])[0]
+
+    return of_gmsh(draw, 0.5)
+
+
+def rigid_corner():
+    still = (0.0, 0.0, 0.0)
+    return drawn_corner().rigid(density=1e3, motion=still, rotation=still, name="corner")
+
+
+def thrown(masters, friction=0.0, t_end=0.12, integration="nodes", **soft):
     """A cube thrown, spinning, into a corner of Gmsh's tetrahedra, and how it ends."""
     mesh = create_box(MPI.COMM_WORLD, [[0.1] * 3, [0.6] * 3], [3] * 3, CellType.hexahedron)
     cube = nts.Continuum(
@@ -162,29 +265,26 @@ def thrown(masters, friction=0.0, t_end=0.12, **soft):
             [-3.0 - 2.0 * (x[1] - 0.3), 2.0 * (x[0] - 0.3) - 2.5, -2.0 + 0.0 * x[0]]
         ),
     )  # fmt: skip
-
-    def draw(occ):
-        whole, hole = occ.addBox(-0.4, -0.4, -0.4, 2.4, 2.4, 2.4), occ.addBox(0, 0, 0, 3, 3, 3)
-        return occ.cut([(3, whole)], [(3, hole)])[0]
-
-    part = of_gmsh(draw, 0.5)
+    corner = rigid_corner()
     if soft:
-        corner = part.continuum(nts.NeoHookean(**soft), density=1e3, degree=1, name="corner")
-    else:
-        still = (0.0, 0.0, 0.0)
-        corner = part.rigid(density=1e3, motion=still, rotation=still, name="corner")
+        law = nts.NeoHookean(**soft)
+        corner = drawn_corner().continuum(law, density=1e3, degree=1, name="corner")
     each = [lambda x, k=k: within(x) & (np.abs(x[k]) < 1e-9) for k in range(3)]
     chosen = {"one": [within], "each": each}[masters]
     own = cube.surface(everywhere)
-    pairs = [nts.ContactPair(own, corner.surface(m), friction=friction) for m in chosen]
+    pairs = [
+        nts.ContactPair(own, corner.surface(m), friction=friction, integration=integration)
+        for m in chosen
+    ]
     system = nts.System([cube, corner], contacts=pairs)
     return nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=t_end, accuracy="exact")
 
 
 @pytest.mark.mpi
-def test_a_cube_thrown_into_a_corner_is_held_out_of_three_faces():
+@over
+def test_a_cube_thrown_into_a_corner_is_held_out_of_three_faces(integration):
     """One contact of all faces gives the motion that a contact of each of them gives."""
-    one, each = (thrown(masters) for masters in ("one", "each"))
+    one, each = (thrown(m, integration=integration) for m in ("one", "each"))
     assert one.status == each.status == "completed"
     assert np.abs(one.state.u[0] - each.state.u[0]).max(initial=0.0) < 1e-9
     energy = one.balance["energy"]

@@ -14,7 +14,7 @@ from scenes import box
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact.pair import Motion
+from dolfinx_nts.contact.candidates import Motion
 from dolfinx_nts.contact.skins import locate_facets
 from dolfinx_nts.parallel import together
 
