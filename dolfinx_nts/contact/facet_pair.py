@@ -366,8 +366,7 @@ class FacetPair(ContactPair, master=Surface):
 
     def _foot_moves(self, patch: IntArray, xi: FloatArray) -> FloatArray:
         """Largest part (n,) that a point of the master which may move has in feet (n, 2)."""
-        points = self.master.patches[patch]
-        weights = self.master.weights
+        points, weights = self.master.patches[patch], self.master.weights
         foot, _, _ = facets.shape(xi, (points if weights is None else weights).shape[1])
         if weights is not None:
             foot = np.einsum("nk,nkp->np", foot, weights[patch])

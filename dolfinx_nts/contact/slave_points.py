@@ -172,7 +172,7 @@ class SlavePoints:
         The mean gap around such a slave has none of its own motion, and repeats those of its
         neighbours. So it has no multiplier, and those beside it on its facets have its hat, too:
         hats sum up to one as before, and a uniform pressure stays one. Where it keeps off, its mean
-        says nothing but while these press, and their hats stay narrow.
+        is open while these press, and their hats stay narrow.
 
         Args:
             points: The points.
