@@ -354,14 +354,16 @@ class FacetPair(ContactPair, master=Surface):
         """
         movable = ~self.slave.fixed[self.slave.share[node]].all(axis=1)
         held = np.flatnonzero(~movable)
-        points = self.master.patches[patch[held]]
-        if self.master.weights is None:
-            foot, _, _ = facets.shape(xi[held], points.shape[1])
-        else:
-            weights = self.master.weights[patch[held]]
-            foot, _, _ = facets.shape(xi[held], weights.shape[1])
-            foot = np.einsum("nk,nkp->np", foot, weights)
-        free = ~self.master.fixed[points].all(axis=2)
-        moves = (np.abs(foot) * free).max(axis=1)
+        moves = self._foot_moves(patch[held], xi[held])
         movable[held] = moves > np.maximum(_STILL, depth[held])
         return movable
+
+    def _foot_moves(self, patch: IntArray, xi: FloatArray) -> FloatArray:
+        """Largest part (n,) that a point of the master which may move has in feet (n, 2)."""
+        points, weights = self.master.patches[patch], self.master.weights
+        foot, _, _ = facets.shape(xi, (points if weights is None else weights).shape[1])
+        if weights is not None:
+            foot = np.einsum("nk,nkp->np", foot, weights[patch])
+        free = ~self.master.fixed[points].all(axis=2)
+        moves: FloatArray = (np.abs(foot) * free).max(axis=1)
+        return moves

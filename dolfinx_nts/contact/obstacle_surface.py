@@ -14,7 +14,7 @@ from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Obstacle, inverse
 from dolfinx_nts.contact.segments import FACING
-from dolfinx_nts.contact.slave_points import OverMaster, SlavePoints, check_slave, sums_of
+from dolfinx_nts.contact.slave_points import OverMaster, SlavePoints, check_slave, moved, sums_of
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements
 from dolfinx_nts.contact.surface_sums import FacetAttachment
 from dolfinx_nts.interaction.elements import Step
@@ -101,11 +101,22 @@ class ObstacleSurfacePair(ObstaclePair, master=Obstacle, integration="surface"):
         slave, reach = self.slave, 0.0 if motion is None else motion.reach
         at = positions[0] - path[0]
         points = self._measured(self._points, at)
-        found: Any = self._own.nodes(self._facing(points, at))
+        points = self._facing(points, at)
+        if len(self._own.supported):
+            points = self._own.hand_over(points, *self._prescribed(positions, path, motion))
+        found: Any = self._own.nodes(points)
         found = found.select(found.gap < reach + MARGIN * found.length)
         sizes = facets.size(slave.reference[slave.facets])
         cover = reach + MARGIN * float(sizes.min(initial=np.inf))
         return Found(found, np.ones(len(slave.share), dtype=bool), cover)
+
+    def _prescribed(
+        self, positions: Sequence[FloatArray], path: FloatArray, motion: Motion | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """What `SlavePoints.hand_over` takes. Collective."""
+        (x,) = moved(self, positions, motion)
+        found = self.obstacle.gap(x[self._own.supported] - path[1])
+        return found.value, found.gradient[:, 0]
 
     def _measured(self, points: OverMaster, at: FloatArray) -> OverMaster:
         """Points with gaps and normals by positions relative to the obstacle's motion [m]."""
@@ -127,8 +138,7 @@ class ObstacleSurfacePair(ObstaclePair, master=Obstacle, integration="surface"):
         cosine = np.einsum("ni,ni->n", turn, across) * inverse(lengths)
         level = cosine < -np.sqrt(1.0 - LEVEL**2)
         chosen = points.select((cosine < FACING)[points.own])
-        sharp = np.append(self._sharp[slave.share], False)[chosen.slot]
-        out = sharp & ~level[chosen.own][:, None]
+        out = self._sharp[slave.face_nodes[chosen.own]] & ~level[chosen.own][:, None]
         chosen = chosen._replace(
             slot=np.where(out, -1, chosen.slot), part=np.where(out, 0.0, chosen.part)
         )

@@ -6,20 +6,27 @@ in those of their facet (theory section 17). Which points take part is the pair'
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.surface_sums import Sums
-from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Part of a node's area that has to lie over the master for it to be a candidate: rows of less
 #: would be nearly those of its neighbours.
 _COVERED = 1e-3
+#: Part of a motion that a slave whose gap is prescribed may make along the normal, or its foot, and
+#: gap over the size of the facets with which it lies on the master.
+PRESCRIBED = 1e-2
+#: Corners of a facet that lie beside each corner.
+_BESIDE = {3: ~np.eye(3, dtype=bool), 4: np.roll(np.eye(4, dtype=bool), 1, axis=1)}
+_BESIDE[4] = _BESIDE[4] | _BESIDE[4].T
 
 
 class SurfaceCandidates(NamedTuple):
@@ -85,6 +92,16 @@ class OverMaster(NamedTuple):
         return OverMaster._make(a[chosen] for a in self)
 
 
+def moved(
+    pair: ContactPair, positions: Sequence[FloatArray], motion: Motion | None
+) -> Sequence[FloatArray]:
+    """Positions of all points of a pair's surfaces after a motion [m]. Collective."""
+    if motion is None:
+        return positions
+    ways = gather_each(pair.surfaces, motion.paths)
+    return tuple(x + way for x, way in zip(positions, ways, strict=True))
+
+
 def check_slave(pair: ContactPair) -> None:
     """Raise a ValueError unless a pair may be integrated over its slave. Collective."""
     if not len(pair.slave.facets):
@@ -141,6 +158,45 @@ class SlavePoints:
         slot = np.where(own_nodes.any(axis=2), self._position[nodes], -1)
         hat = np.einsum("nkc,nc->nk", own_nodes, hats)
         return slave.shape(facet, xi), slot, hat, area[:, None] * hat
+
+    @cached_property
+    def supported(self) -> IntArray:
+        """Points of the slave of which a support holds a coordinate, on all ranks alike, (m,)."""
+        return np.flatnonzero(self._slave.fixed.any(axis=1))
+
+    def hand_over(
+        self, points: OverMaster, gap: FloatArray, normal: FloatArray
+    ) -> OverMaster:
+        """The same points, with hats of slaves handed on that supports hold on or in the master.
+
+        The mean gap around such a slave has none of its own motion, and repeats those of its
+        neighbours. So it has no multiplier, and those beside it on its facets have its hat, too:
+        hats sum up to one as before, and a uniform pressure stays one. Where it keeps off, its mean
+        is open while these press, and their hats stay narrow.
+
+        Args:
+            points: The points.
+            gap: Of `supported` at the step's end, if it is prescribed [m], else inf, shape (m,).
+            normal: Of the master there, shape (m, 3).
+        """
+        slave, at = self._slave, self.supported
+        on = gap <= PRESCRIBED * np.sqrt(slave.area[at])
+        on &= np.linalg.norm(normal * ~slave.fixed[at], axis=1) <= PRESCRIBED
+        if not on.any():
+            return points
+        held = np.isin(np.arange(len(slave.points)), at[on])
+        corners, nodes = slave.facets[points.own], slave.face_nodes[points.own]
+        of_facet, beside = held[corners], _BESIDE[corners.shape[1]]
+        to = beside & ~of_facet[:, None]
+        # Beside a slave whose neighbours are held, too, is the corner across.
+        to |= ~to.any(axis=2, keepdims=True) & ~of_facet[:, None]
+        to = np.where(of_facet[:, :, None], to, np.eye(len(beside), dtype=bool))
+        share = to / np.maximum(to.sum(axis=2, keepdims=True), 1)
+        own = (nodes[:, :, None] == corners[:, None]).astype(float)
+        passed = np.matmul(np.matmul(own, share), own.transpose(0, 2, 1))
+        hat, part = (np.einsum("nk,nkl->nl", of, passed) for of in points[-2:])
+        slot = np.where(held[nodes], -1, points.slot)
+        return points._replace(slot=slot, hat=hat, part=part)
 
     @cached_property
     def none(self) -> OverMaster:

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.contact import passages
+from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.candidates import MARGIN, Found, Motion
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
 from dolfinx_nts.contact.segments import near, segments
-from dolfinx_nts.contact.slave_points import OverMaster, SlavePoints, check_slave, sums_of
+from dolfinx_nts.contact.slave_points import (
+    PRESCRIBED,
+    OverMaster,
+    SlavePoints,
+    check_slave,
+    moved,
+    sums_of,
+)
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements
 from dolfinx_nts.contact.surface_sums import FacetAttachment
-from dolfinx_nts.contact.surfaces import Surface, gather_each
+from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.parallel import Asking, raise_together
@@ -59,18 +67,35 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
     ) -> Asking[Found]:
         """Nodes of this rank with facets over the master, as of `ContactPair`."""
         yield from ()
-        reach, at = 0.0 if motion is None else motion.reach, tuple(positions)
-        if motion is not None and motion.solved:
+        reach, at = 0.0 if motion is None else motion.reach, positions
+        solved = motion is not None and motion.solved
+        end = moved(self, positions, motion) if solved or self._supported else positions
+        if solved:
             # An equilibrium is one of the pieces that it has itself.
-            reach, ways = 0.0, gather_each(self.surfaces, motion.paths)
-            at = tuple(x + way for x, way in zip(positions, ways, strict=True))
+            reach, at = 0.0, end
         sizes = facets.size(at[1][self.master.facets])
         points = self._over(at, reach, reach + MARGIN * float(sizes.max()))
-        if at[0] is not positions[0]:
+        if solved:
             points = self._seen_from(points, positions)
+        if self._supported:
+            points = self._own.hand_over(points, *self._prescribed(end))
         cover = (0.0 if motion is None else motion.reach) + MARGIN * float(sizes.min())
         found: Any = self._own.nodes(points)
         return Found(found, np.ones(len(self.slave.share), dtype=bool), cover)
+
+    @cached_property
+    def _supported(self) -> bool:
+        """Whether supports hold points of both surfaces, on all ranks alike."""
+        return bool(len(self._own.supported) and self.master.fixed.all(axis=1).any())
+
+    def _prescribed(self, positions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """What `SlavePoints.hand_over` takes, at positions of all points [m]."""
+        slaves, master = positions
+        x = slaves[self._own.supported]
+        facet = search.closest_facets(x, master[self.master.facets], reach=np.inf).facet
+        xi, converged, normal, gap = self._measured(x, master, facet)
+        still = converged & (self._foot_moves(facet, xi) <= PRESCRIBED)
+        return np.where(still, gap, np.inf), normal
 
     def _over(
         self, positions: Sequence[FloatArray], reach: float, radius: float
