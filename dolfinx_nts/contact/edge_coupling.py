@@ -446,6 +446,5 @@ class EdgeCoupling:
         (part,), factor = parts, self._step.factor
         # Where no node is held, what a rim passes is followed also while it does not press.
         on = part.active | (not self.contact.pair.holds_nodes)
-        force, tangential = -part.multiplier[:, 0] / factor, part.tangential / factor
-        force = np.where(part.active, force, 0.0)
-        return EdgeHistory(self._chosen[on], force[on], tangential[on])
+        force = np.where(part.active, -part.multiplier[:, 0] / factor, 0.0)
+        return EdgeHistory(self._chosen[on], force[on], part.tangential[on] / factor)

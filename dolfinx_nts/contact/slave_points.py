@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.contact.candidates import Motion
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surface_sums import Sums
 from dolfinx_nts.contact.surfaces import Surface, gather_each
 from dolfinx_nts.kernels import facets

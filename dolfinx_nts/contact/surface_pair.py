@@ -91,8 +91,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
     def _prescribed(self, positions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """What `SlavePoints.hand_over` takes, at positions of all points [m]."""
         slaves, master = positions
-        x = slaves[self._own.supported]
-        facet = search.closest_facets(x, master[self.master.facets], reach=np.inf).facet
+        x, mine = slaves[self._own.supported], np.flatnonzero(self.convex.faces == self.face)
+        facet = mine[search.closest_facets(x, master[self.master.facets[mine]], reach=np.inf).facet]
         xi, converged, normal, gap = self._measured(x, master, facet)
         still = converged & (self._foot_moves(facet, xi) <= PRESCRIBED)
         return np.where(still, gap, np.inf), normal
