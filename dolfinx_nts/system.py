@@ -312,7 +312,10 @@ class System:
             old = contacts[n]
             new, known = np.zeros_like(old.overlap), np.isfinite(old.gap)
             new[found.node] = np.maximum(-found.gap, 0.0) / left
-            contacts[n] = old._replace(overlap=np.where(known, old.overlap, new))
+            # In an inner edge it is that of this face, whichever is nearer in the first load step.
+            facet = old.facet.copy()
+            facet[found.node] = np.where(known[found.node], facet[found.node], found.facet)
+            contacts[n] = old._replace(overlap=np.where(known, old.overlap, new), facet=facet)
         return replace(state, contacts=tuple(contacts))
 
     def refuse_overlap(self, state: State) -> None:

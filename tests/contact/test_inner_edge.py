@@ -281,6 +281,35 @@ def thrown(masters, friction=0.0, t_end=0.12, integration="nodes", **soft):
 
 
 @pytest.mark.mpi
+def test_a_rigid_cube_is_fitted_into_a_soft_corner():
+    """It overlaps with three faces by different ways, each of which is pressed out evenly.
+
+    Which face is the nearest changes with the load steps; an overlap is that of its face.
+    """
+    each = [lambda x, k=k: within(x) & (np.abs(x[k]) < 1e-9) for k in range(3)]
+
+    def fitted(masters):
+        held = nts.Dirichlet(lambda x: (x < -0.4 + 1e-9).any(axis=0))
+        law = nts.NeoHookean(young=1e6, poisson=0.3)
+        corner = drawn_corner().continuum(law, density=1e3, degree=1, bcs=[held], name="corner")
+        mesh, still = box([-0.004, -0.002, -0.003], [0.496, 0.498, 0.497], [2] * 3), (0, 0, 0)
+        cube = nts.RigidBody(mesh, density=1e3, motion=still, rotation=still, name="cube")
+        own = cube.surface(everywhere)
+        pairs = [nts.ContactPair(own, corner.surface(m), interference="resolve") for m in masters]
+        run = nts.equilibrium(nts.System([cube, corner], contacts=pairs), load_steps=3)
+        assert run.status == "completed"
+        return run
+
+    one, apart = fitted([within]), fitted(each)
+    for name in ("potential", "interference_work"):
+        assert one.balance[name] == pytest.approx(apart.balance[name], rel=1e-6), name
+    assert np.allclose(
+        one.contact_forces.sum(axis=1), apart.contact_forces.sum(axis=1), rtol=0.0,
+        atol=1e-6 * np.abs(apart.contact_forces).max(),
+    )  # fmt: skip
+
+
+@pytest.mark.mpi
 @over
 def test_a_cube_thrown_into_a_corner_is_held_out_of_three_faces(integration):
     """One contact of all faces gives the motion that a contact of each of them gives."""
