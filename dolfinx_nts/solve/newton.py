@@ -152,6 +152,7 @@ class StepSolver:
             unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
             if unsolved and (preset := self._presets.alternative(self.snes)) is not None:
                 return self._attempt_otherwise(preset, iterations)
+            unsolved |= reason == PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
         self._tangents.due = True
         failure = self._failure(last, reason, iterations)
         if unsolved:

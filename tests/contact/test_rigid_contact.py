@@ -4,6 +4,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from gmsh_parts import of_gmsh
 from integrators import MID_STEP
 from scenes import box, everywhere
 from scipy.spatial.transform import Rotation
@@ -434,3 +435,27 @@ def test_rolling_in_a_bore_swings_as_rolling_says(make, facets, gyration):
     stepper.close()
     assert passes == pytest.approx(quarter, rel=0.01)
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["kinetic"].max()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("friction", [0.1, 0.3])
+def test_a_block_in_a_corner_of_three_planes_rests(friction):
+    """It is held more often than it has freedom; an iterate that is not finite spoils no other.
+
+    Its factors were kept, and all shorter steps failed with them.
+    """
+
+    def draw(occ):
+        whole, cut = occ.addBox(0, 0, 0, 0.05, 0.04, 0.06), occ.addBox(0.03, 0.02, 0.05, 1, 1, 1)
+        return occ.cut([(3, whole)], [(3, cut)])[0]
+
+    block = of_gmsh(draw, 0.016).rigid(density=1100.0, name="block")
+    own, gravity = block.surface(everywhere), np.array([-3.0, -2.0, -9.81])
+    planes = [nts.Plane((0, 0, 0), normal) for normal in np.eye(3)]
+    pairs = [nts.ContactPair(own, plane, friction=friction) for plane in planes]
+    system = nts.System([block], contacts=pairs, gravity=gravity)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.02)
+    assert run.status == "completed"
+    weight = -block.mass * gravity
+    assert run.contact_forces[-1].sum(axis=0) == pytest.approx(weight, rel=1e-6)
+    assert np.abs(block.position - block.centre).max() < 1e-9
