@@ -25,7 +25,7 @@ class Apart:
     """Distances of surfaces from each other and from obstacles, of contacts that hold nodes out.
 
     Args:
-        contacts: Those of a system, and corners.
+        contacts: Those of a system, and what is added to them.
         bodies: Numbers of the bodies of each.
 
     Attributes:
@@ -131,7 +131,7 @@ class Apart:
         """What contacts remember of a step in which they have no candidates.
 
         Args:
-            old: Of the step before, of each contact and corners.
+            old: Of the step before, of each contact and of what is added.
             followed: As of `ContactHistory`, of those that were sought.
         """
         found = [

@@ -22,7 +22,7 @@ ASIDE = 1e-4
 #: A node this part of a facet behind it, or less, is outside.
 OUTSIDE = 1e-6
 #: Least cosine between normals of facets whose convex edge is one of a curved surface, such as a
-#: cylinder of twelve facets; that of an inner edge is `patches.SHARP`.
+#: cylinder of twelve facets.
 SHARP = 0.85
 #: That of facets at an inner edge, in which a node is held out of both. In a bore of facets one
 #: that slides is behind the next one for a step, by less than they sag.

@@ -105,7 +105,7 @@ class HeldSlip:
     to move nothing is known.
 
     Args:
-        pairs: Contacts of a system, and corners.
+        pairs: Contacts of a system, and what is added to them.
         places: Of their points.
     """
 

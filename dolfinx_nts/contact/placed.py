@@ -13,7 +13,7 @@ class Placed:
     """Positions of the points of a system's contacts, and of corners.
 
     Args:
-        contacts: The contacts, and corners after them.
+        contacts: The contacts, and after them what is added to them.
         bodies: Numbers of the bodies of each.
 
     Attributes:

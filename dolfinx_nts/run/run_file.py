@@ -127,7 +127,7 @@ def load(path: StrPath) -> Saved:
         raise OSError(f"path={str(path)!r}: cannot be read, it may be damaged ({error})") from error
     scene = notes["scene"]
     groups: dict[str, Rows] = {kind: [{} for _ in scene[kind]] for kind in ("bodies", "joints")}
-    # Corners of contacts follow these.
+    # What is added to contacts follows these.
     pairs = {place.split("/")[1] for place in tables if place.startswith("contacts/")}
     groups["contacts"] = [{} for _ in pairs]
     for place, values in tables.items():
