@@ -19,9 +19,8 @@ from dolfinx_nts.types import FloatArray
 #: heap most steps settle by the fifth, and those that do not hardly ever do later.
 _CLEAR = 4
 #: The first width, over the largest of the lengths by which nodes that do not settle miss their
-#: laws, forces over the masses that they move; and over the last width, as what they miss may be
-#: rounding.
-_FIRST, _LEAST = 0.1, 100.0
+#: laws, forces over the masses that they move.
+_FIRST = 0.1
 #: A blurred law counts as solved where rows miss less than this part of widths and bounds; ...
 _NEAR = 0.8
 #: ... the next one's width is this part of its width.
@@ -166,9 +165,8 @@ class BlurredContacts:
             largest = max(largest, float(rows[changes].max(initial=0.0)))
             least = min(least, float(batch.law.still.min(initial=np.inf)))
         sizes = global_max(self._problem.system.comm, np.array([largest, -least]))
-        missed, self._last = float(sizes[0]), -float(sizes[1])
-        self._width = max(_FIRST * missed, _LEAST * self._last)
-        self.blurs, self._tries = 0.0 < missed < np.inf and self._width < np.inf, 0
+        self._width, self._last = _FIRST * float(sizes[0]), -float(sizes[1])
+        self.blurs, self._tries = 0.0 < self._width < np.inf, 0
         self._sharp = _PARTED * self._width
         self._problem.shared_weight.kept |= self.blurs
         return self.blurs
