@@ -44,11 +44,11 @@ class ContactHistory(NamedTuple):
 
     def beside(self, other: ContactHistory) -> ContactHistory:
         """What both know of the same nodes: forces in all, and the smaller gap."""
-        carry, sticks = self.force > 0.0, (self.force <= 0.0) | self.stick
+        slides = (self.force > 0.0) & ~self.stick | (other.force > 0.0) & ~other.stick
         return self._replace(
             force=self.force + other.force, gap=np.minimum(self.gap, other.gap),
             tangential=self.tangential + other.tangential,
-            stick=np.where(other.force > 0.0, sticks & other.stick, self.stick & carry),
+            stick=(self.stick | other.stick) & ~slides,
             slip=np.maximum(self.slip, other.slip),
         )  # fmt: skip
 

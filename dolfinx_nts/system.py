@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -63,7 +63,7 @@ class System:
         size: Coordinates of all bodies.
         declared_joints: As given, each followed by its parts.
         joints: These, then those that bodies bring, such as what keeps a rigid body rigid.
-        pairs: Contacts, then the corners of those whose masters have any.
+        pairs: Contacts, then what is added to them: corners of their masters, and other faces.
         contact_of: Number of the contact that each of these belongs to.
         edges: Contact of edges by the number of the contact that has any.
 
@@ -125,6 +125,11 @@ class System:
         ]  # fmt: skip
         self.pairs = (*self.contacts, *(c for _, c in added))
         self.contact_of = [*range(len(self.contacts)), *(k for k, _ in added)]
+        #: Of each contact those of `pairs` that hold its slave, itself first.
+        self.holding = [[k] for k in range(len(self.contacts))]
+        for n, (k, c) in enumerate(added, len(self.contacts)):
+            if not c.exchanged:
+                self.holding[k].append(n)
         self.pair_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.pairs]
         self.edges: dict[int, EdgeContact] = {}
         for k, (pair, numbers) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
@@ -240,12 +245,7 @@ class System:
 
     def of_slaves(self, histories: Sequence[ContactHistory]) -> list[ContactHistory]:
         """What each of its contacts remembers of its slave nodes, from that of each of `pairs`."""
-        n = len(self.contacts)
-        found = list(histories[:n])
-        for k, pair, more in zip(self.contact_of[n:], self.pairs[n:], histories[n:], strict=True):
-            if not pair.exchanged:
-                found[k] = found[k].beside(more)
-        return found
+        return [reduce(ContactHistory.beside, [histories[n] for n in of]) for of in self.holding]
 
     def slave_area(self, k: int, state: State) -> FloatArray:
         """Present area that carries at each point of a slave [m^2], (points,). Collective.

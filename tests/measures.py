@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import dolfinx_nts as nts
 from dolfinx_nts.run.locking_watch import LockingWatch
 
 #: Offsets and weights of differences that are exact for polynomials up to degree 4, whatever the
@@ -50,6 +51,45 @@ def block_errors(found, expected, blocks):
             scale = np.abs(f if f.any() else found).max(initial=0.0)
             errors[i, j] = np.abs(f - e).max(initial=0.0) / scale
     return errors
+
+
+def assert_tangent(run, look):
+    """The matrix of a step from a run's end is the derivative of its residual, to 1e-6.
+
+    Args:
+        run: Of contacts whose nodes partly stick and partly slip.
+        look: Is shown the problem of the step and its iterate.
+    """
+    stepper = nts.Stepper(run.system, nts.EnergyMomentum(), start=run)
+    problem = stepper.problem
+    problem.begin(stepper.state, 0.5)
+    rng, laid = np.random.default_rng(3), problem.laid
+    multipliers = laid.of_elements("constraints")
+    with problem.x as x:
+        x[: multipliers.start] += 1e-4 * rng.normal(size=multipliers.start)
+        x[multipliers] *= 1.0 + 0.1 * rng.random(multipliers.stop - multipliers.start)
+    at_x = problem.evaluate(problem.x)
+    look(problem, at_x)
+    for sticks in (True, False):
+        assert any((part.active & (part.stick == sticks)).any() for part in at_x.parts)
+    stepper.solver.assemble(at_x)
+    way, found = problem.x.duplicate(), problem.x.duplicate()
+    for here in (slice(0, multipliers.start), multipliers):
+        direction = np.zeros(len(at_x.x))
+        direction[here] = rng.normal(size=here.stop - here.start)
+        direction[laid.held] = 0.0
+        # Forces are to motions as the bodies are stiff.
+        step = 1e-6 * np.abs(at_x.x[here]).max()
+        expected = np.zeros(len(direction))
+        for k, w in STENCIL:
+            way.array_w[:] = at_x.x + k * step * direction
+            expected += w / step * problem.residual(problem.evaluate(way))
+        way.array_w[:] = direction
+        stepper.solver.matrix.operator.mult(way, found)
+        assert relative(found.array_r, expected) < 1e-6
+    for vector in (way, found):
+        vector.destroy()
+    stepper.close()
 
 
 # ---- balance tables

@@ -24,7 +24,7 @@ from dolfinx_nts.contact.left_behind import unheld
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.placed import Placed
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before, meeting
-from dolfinx_nts.contact.valleys import bind, tell_met
+from dolfinx_nts.contact.valleys import Face, bound, tell_met
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -72,10 +72,13 @@ class ContactSearch:
         for k, pair in enumerate(contacts):
             if pair.of and not pair.exchanged:
                 self._beside.setdefault(self._places.own[k], []).append(k)
+        held = [(own, *beside) for own, beside in self._beside.items()]
+        self._faces = [each for each in held if contacts[each[0]].holds_nodes]
         self.edges: dict[int, EdgeCoupling] = {}
         self._apart, self.held = Apart(contacts, bodies), HeldSlip(contacts, self._places)
         self._sought: list[int] = []
         self._cover, self._repeats = [0.0] * len(contacts), 0
+        # Candidates that elements were made of.
         self._raw: dict[int, Any] = {}
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
@@ -162,17 +165,13 @@ class ContactSearch:
 
     def _bind(self, found: dict[int, Any]) -> None:
         """Let nodes in inner edges stay with what has held them out of a face. Collective."""
-        for own, beside in self._beside.items():
-            each = [k for k in (own, *beside) if k in found]
-            if len(each) < 2 or not self._pairs[own].holds_nodes:
-                continue
-            raw, faces = [self._raw[k] for k in each], found[own].pair.convex.faces
-            before = [np.where(old.facet < 0, pair.adjusted, old.facet)
-                      for pair, old in ((self._pairs[k], self._old[k]) for k in each)]  # fmt: skip
-            new = bind(raw, before, faces)
-            if anywhere(self._comm, new is not None):
-                both = zip(each, new or raw, strict=True)
-                found |= {k: self._made(k, c) for k, c in both}
+        numbers = [[k for k in each if k in found] for each in self._faces]
+        groups = [
+            {k: Face(self._pairs[k], self._raw[k], self._old[k].facet) for k in each}
+            for each in numbers if len(each) > 1
+        ]  # fmt: skip
+        for k, candidates in bound(self._comm, groups).items():
+            found[k] = self._made(k, candidates)
 
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""

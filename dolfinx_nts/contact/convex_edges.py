@@ -44,7 +44,7 @@ class ConvexEdges:
         joined: As of `patches.neighbours`, without sharp edges.
         sharp: Which facets have a sharp edge, shape (m,).
         inner: Ends of the edges at which the master turns towards its slaves, shape (n, 2).
-        inner_facets: The two facets of each, shape (n, 2).
+        inner_facets: The two facets of each, ascending, shape (n, 2).
     """
 
     def __init__(self, at: IntArray, corners: FloatArray) -> None:
@@ -75,11 +75,9 @@ class ConvexEdges:
 
         Others may have the same, so that there are few.
         """
-        one, two, _ = self.smooth
-        size = len(self.sharp)
-        inner = np.isin(one * size + two, self.inner_facets @ [size, 1])
-        inner |= np.isin(two * size + one, self.inner_facets @ [size, 1])
-        one, two = one[~inner], two[~inner]
+        size, smooth = len(self.sharp), np.sort(np.column_stack(self.smooth[:2]), axis=1)
+        key = [size, 1]
+        one, two = smooth[~np.isin(smooth @ key, self.inner_facets @ key)].T
         joined = coo_array((np.ones(len(one)), (one, two)), shape=(size, size))
         count, face = connected_components(joined, directed=False)
         number, meet = np.full(count, -1), face[self.inner_facets]

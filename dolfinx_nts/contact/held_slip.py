@@ -80,20 +80,32 @@ class _Contact:
         return closed
 
 
-class _Hold(NamedTuple):
-    """What holds slaves of a batch.
+class _Wall(NamedTuple):
+    """Another contact that may hold slaves of a batch.
 
     Attributes:
-        by: Number of the batch that does; None: supports.
+        by: Number of its batch.
         here: The slaves, shape (m,).
-        there: What they are in the other batch, shape (m,).
+        there: What they are in that batch, shape (m,).
         along: Unit vectors in their frames, shape (m, 2).
     """
 
-    by: int | None
+    by: int
     here: IntArray
     there: IntArray
     along: FloatArray
+
+
+class _Holds(NamedTuple):
+    """What holds slaves of a batch.
+
+    Attributes:
+        supports: Sums of the squares of directions in which supports do, shape (n, 2, 2).
+        walls: Other contacts that may.
+    """
+
+    supports: FloatArray
+    walls: list[_Wall]
 
 
 class HeldSlip:
@@ -111,7 +123,7 @@ class HeldSlip:
 
     def __init__(self, pairs: Sequence[ContactPair], places: Placed) -> None:
         self._pairs, self._places = pairs, places
-        self._holds: dict[int, list[_Hold]] = {}
+        self._holds: dict[int, _Holds] = {}
 
     def begin(
         self, step: Step, begun: State, numbers: Sequence[int], elements: Sequence[ContactElements]
@@ -128,20 +140,27 @@ class HeldSlip:
         rubs = [i for i, c in enumerate(elements) if _rubs_over_surface(c)]
         if not rubs:
             return
-        each = [self._places.at(numbers, u) for u in (begun.u, step.state.u, step.first)]
-        contacts = []
-        for k, c in zip(numbers, elements, strict=True):
+        bodies = {id(elements[i].pair.slave.body) for i in rubs}
+        beside = [i for i, c in enumerate(elements) if id(c.pair.slave.body) in bodies]
+        here = [numbers[i] for i in beside]
+        each = [self._places.at(here, u) for u in (begun.u, step.state.u, step.first)]
+        of_body: dict[int, list[tuple[int, _Contact]]] = {}
+        for i, k in zip(beside, here, strict=True):
             first, now, then = (at[k] for at in each)
-            contacts.append(_Contact(c, first, now, then, self._paths(k, step, begun)))
-        for i in rubs:
-            one, body = contacts[i], elements[i].pair.slave.body
-            if one.way is None:
-                continue
-            found = _supports(one, one.way)
-            for k, wall in enumerate(contacts):
-                if k != i and elements[k].pair.slave.body is body and wall.way is not None:
-                    found.append(_wall(one, one.way, wall, wall.way, k))
-            self._holds[i] = [hold for hold in found if len(hold.here)]
+            contact = _Contact(elements[i], first, now, then, self._paths(k, step, begun))
+            of_body.setdefault(id(elements[i].pair.slave.body), []).append((i, contact))
+        for contacts in of_body.values():
+            for i, one in contacts:
+                if i not in rubs or one.way is None:
+                    continue
+                walls = [
+                    _wall(one, one.way, wall, wall.way, k)
+                    for k, wall in contacts if k != i and wall.way is not None
+                ]  # fmt: skip
+                walls = [wall for wall in walls if len(wall.here)]
+                supports = _supports(one, one.way)
+                if walls or supports.any():
+                    self._holds[i] = _Holds(supports, walls)
 
     def _paths(self, k: int, step: Step, begun: State) -> FloatArray:
         """`_Contact.paths` of a contact by its number. Collective."""
@@ -157,39 +176,41 @@ class HeldSlip:
             elements: Those of all contacts, as of `begin` but for their laws.
             own: Of each its own unknowns.
         """
-        for i, holds in self._holds.items():
-            total = np.zeros((len(elements[i].candidates.node), 2, 2))
-            for by, here, there, along in holds:
-                on = np.ones(len(here), dtype=bool)
-                if by is not None:
-                    # What friction itself presses against a wall ends as soon as that holds.
-                    rubs = elements[i].carries(own[i])[here, 1:]
-                    pressed = -elements[by].carries(own[by])[there, 0]
-                    pressed -= np.einsum("na,na->n", rubs, along).clip(min=0.0)
-                    on = pressed > elements[by].law.no_force[there]
-                np.add.at(total, here[on], along[on, :, None] * along[on, None])
+        for i, (supports, walls) in self._holds.items():
+            total = supports.copy()
+            for by, here, there, along in walls:
+                # What friction itself presses against a wall ends as soon as that holds.
+                rubs = elements[i].carries(own[i])[here, 1:]
+                pressed = -elements[by].carries(own[by])[there, 0]
+                pressed -= np.einsum("na,na->n", rubs, along).clip(min=0.0)
+                _add(total, here, along, pressed > elements[by].law.no_force[there])
             if total.any():
                 own[i]["held"] = projector(total, LEAST_OWN)
+
+
+def _add(total: FloatArray, here: IntArray, along: FloatArray, on: BoolArray) -> None:
+    """Add squares of directions (m, 2) of slaves (m,) that are chosen (m,) to sums (n, 2, 2)."""
+    np.add.at(total, here[on], along[on, :, None] * along[on, None])
 
 
 def _rubs_over_surface(c: ContactElements) -> bool:
     return isinstance(c, SurfaceElements) and c.law.num_tangential > 0
 
 
-def _supports(one: _Contact, master: FloatArray) -> list[_Hold]:
-    """Axes along which supports hold slaves of a contact, whose master moves so [m]."""
+def _supports(one: _Contact, master: FloatArray) -> FloatArray:
+    """`_Holds.supports` of a contact whose master moves so [m]."""
     fixed = one.elements.pair.slave.fixed[one.points]
-    way, found = (one.then[0] - one.begun[0])[one.points] - master, []
+    way, total = (one.then[0] - one.begun[0])[one.points] - master, np.zeros((len(fixed), 2, 2))
     for axis in range(3):
         here = np.flatnonzero(fixed[:, axis])
         normal = np.tile(np.eye(3)[axis], (len(here), 1))
-        found.append(_hold(one, None, here, here, normal, way[here, axis]))
-    return found
+        _add(total, here, *_along(one, here, normal, way[here, axis]))
+    return total
 
 
 def _wall(
     one: _Contact, master: FloatArray, wall: _Contact, way: FloatArray, number: int
-) -> _Hold:
+) -> _Wall:
     """Directions in which another contact may hold slaves of one.
 
     Args:
@@ -203,25 +224,26 @@ def _wall(
     _, here, there = np.intersect1d(
         slave.points[one.points], other.points[wall.points], return_indices=True
     )
-    on = wall.closed[there]
-    here, there = here[on], there[on]
+    closed = wall.closed[there]
+    here, there = here[closed], there[closed]
     normal = wall.elements.candidates.normal[there]
-    return _hold(one, number, here, there, normal, normal @ (way - master))
+    along, on = _along(one, here, normal, normal @ (way - master))
+    return _Wall(number, here[on], there[on], along[on])
 
 
-def _hold(
-    one: _Contact, by: int | None, here: IntArray, there: IntArray, normal: FloatArray,
-    slide: FloatArray,
-) -> _Hold:  # fmt: skip
-    """Those of some slaves that do not slide where something holds them.
+def _along(
+    one: _Contact, here: IntArray, normal: FloatArray, slide: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Directions in which something holds slaves, and whether they do not slide there.
 
     Args:
         one: Their contact.
-        by: As of `_Hold`.
-        here: As of `_Hold`.
-        there: As of `_Hold`.
-        normal: Directions in which it does, shape (m, 3).
+        here: The slaves, shape (m,).
+        normal: Directions in space, shape (m, 3).
         slide: How they move there against the master [m], shape (m,).
+
+    Returns:
+        Unit vectors in their frames, shape (m, 2), and a mask (m,).
     """
     c: Any = one.elements
     along = np.einsum("nai,ni->na", c.frame[here], normal)
@@ -230,4 +252,4 @@ def _hold(
     upright = np.abs(np.einsum("ni,ni->n", c.candidates.normal[here], normal)) <= _CLOSED
     on = (np.abs(slide) <= c.law.still[here]) & (part > _ALONG)
     on &= upright | one.closed[here]
-    return _Hold(by, here[on], there[on], along[on] / part[on, None])
+    return along / np.maximum(part, _ALONG)[:, None], on

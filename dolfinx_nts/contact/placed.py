@@ -10,19 +10,19 @@ from dolfinx_nts.types import FloatArray
 
 
 class Placed:
-    """Positions of the points of a system's contacts, and of corners.
+    """Positions of the points of a system's contacts, and of what is added to them.
 
     Args:
         contacts: The contacts, and after them what is added to them.
         bodies: Numbers of the bodies of each.
 
     Attributes:
-        own: Of each its number, of corners that of their contact.
+        own: Of each its number, of what is added that of its contact.
     """
 
     def __init__(self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]]) -> None:
         number = {id(pair): k for k, pair in enumerate(contacts)}
-        # What corners touch lies where their pair's surfaces do.
+        # What they touch lies where their contact's surfaces do.
         self.own = [number[id(c.of or c)] for c in contacts]
         self._pairs, self._bodies = contacts, bodies
 

@@ -223,8 +223,6 @@ class OtherFaces(SurfacePair):
         super().__init__(
             of.slave, of.master, friction=of.friction, interference=of.interference, name=of.name
         )
-        # Points are where they are for the pair.
-        self.origin, self.extent = of.origin, of.extent
 
 
 def other_faces(pair: Any) -> list[OtherFaces]:

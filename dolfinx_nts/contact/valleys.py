@@ -10,7 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import INNER, middles
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.kernels import facets
-from dolfinx_nts.parallel import Asking
+from dolfinx_nts.parallel import Asking, global_max
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 
@@ -139,36 +141,64 @@ class Valleys(FacetPair):
         return None
 
 
-def bind(
-    found: Sequence[Candidates], before: Sequence[IntArray], faces: IntArray
-) -> list[Candidates] | None:
-    """Let nodes in inner edges stay with what has held them out of a face, or None if they do.
+class Face(NamedTuple):
+    """What holds nodes out of some faces of a master: a contact, or what is added to it.
+
+    Attributes:
+        pair: The contact, or what is added.
+        found: Its candidates.
+        before: Facets of the nodes in the last step, or -1, shape (share,).
+    """
+
+    pair: Any
+    found: Candidates
+    before: IntArray
+
+
+def bound(comm: MPI.Comm, groups: Sequence[Mapping[int, Face]]) -> dict[int, Candidates]:
+    """Candidates that change where nodes stay with what has held them out of a face. Collective.
 
     Which face is nearer changes from step to step; what is remembered of a face is of its pair.
 
     Args:
-        found: Candidates of a contact and of what is added to it for other faces.
-        before: Facets that each had in the last step, or -1, shape (share,).
-        faces: Of the facets, see `ConvexEdges.faces`.
+        comm: MPI communicator.
+        groups: Of contacts that have several, by number.
     """
-    shape = len(found), len(before[0])
+    if not groups:
+        return {}
+    new = [_bound(list(group.values())) for group in groups]
+    changes = global_max(comm, np.array([float(c is not None) for c in new]))
+    found: dict[int, Candidates] = {}
+    for group, own, change in zip(groups, new, changes, strict=True):
+        if change:
+            found |= zip(group, own or [face.found for face in group.values()], strict=True)
+    return found
+
+
+def _bound(faces: Sequence[Face]) -> list[Candidates] | None:
+    """`bound` of one group on this rank; None if nothing changes."""
+    number, shape = faces[0].pair.convex.faces, (len(faces), len(faces[0].before))
     row, have, had = np.full(shape, -1), np.full(shape, -1), np.full(shape, -2)
-    start = np.cumsum([0, *(len(c.node) for c in found)])
-    for k, c in enumerate(found):
-        row[k, c.node], have[k, c.node] = start[k] + np.arange(len(c.node)), faces[c.facet]
-        known = before[k] >= 0
-        had[k, known] = faces[before[k][known]]
+    start = np.cumsum([0, *(len(face.found.node) for face in faces)])
+    for k, (pair, c, before) in enumerate(faces):
+        row[k, c.node], have[k, c.node] = start[k] + np.arange(len(c.node)), number[c.facet]
+        last = np.where(before < 0, pair.adjusted, before)
+        had[k, last >= 0] = number[last[last >= 0]]
     order = row.copy()
-    for i, j in combinations(range(len(found)), 2):
+    for i, j in combinations(range(len(faces)), 2):
         stay = (have[i] == had[i]) + 1 * (have[j] == had[j])
         swap = (have[j] == had[i]) + 1 * (have[i] == had[j]) > stay
         for both in (order, have):
             both[i, swap], both[j, swap] = both[j, swap], both[i, swap]
     if (order == row).all():
         return None
-    every = Candidates._make(np.concatenate(parts) for parts in zip(*found, strict=True))
+    # Of each the gap that counts as none is that of its own face.
+    gaps = [c._replace(gap=c.gap + pair.offset[c.node]) for pair, c, _ in faces]
+    every = Candidates._make(np.concatenate(parts) for parts in zip(*gaps, strict=True))
+    own = [every.select(rows[rows >= 0]) for rows in order]
     return [
-        every.select(rows[rows >= 0])._replace(node=np.flatnonzero(rows >= 0)) for rows in order
+        c._replace(gap=c.gap - face.pair.offset[c.node])
+        for face, c in zip(faces, own, strict=True)
     ]
 
 

@@ -32,8 +32,8 @@ class Saved(Record):
             `reference` X [m], `u` [m], `v` [m/s], and `a` [m/s^2] where the integrator carries any;
             of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`.
         contacts: Of each contact, in their order: `number`, the input numbers of its slave nodes,
-            ascending, and for each of them the fields of `ContactHistory`. Then the same of the
-            masters' corners, see `System.pairs`.
+            ascending, and for each of them the fields of `ContactHistory`. Then the same of what
+            is added to them, see `System.pairs`.
         joints: Of each joint that remembers something, by its name, `number` and `value`.
         scene: Names, kinds and sizes of bodies, contacts and joints.
         versions: Of the packages that made the run.

@@ -349,14 +349,13 @@ class Stepper:
         Returns:
             At this rank's slave nodes, as in `state.contacts`.
         """
-        means = [
-            self._last_steps.mean_force(n) for n, pair in enumerate(self.system.pairs)
-            if self.system.contact_of[n] == k and not pair.exchanged
-        ]  # fmt: skip
-        known = [mean for mean in means if mean is not None]
-        if not known:
-            return self.system.of_slaves(self.state.contacts)[k].force
-        return sum(known[1:], start=known[0])
+        first, *others = (self._mean_force(n) for n in self.system.holding[k])
+        return sum(others, start=first)
+
+    def _mean_force(self, n: int) -> FloatArray:
+        """As `mean_force`, of one of `System.pairs`."""
+        mean = self._last_steps.mean_force(n)
+        return self.state.contacts[n].force if mean is None else mean
 
     def jumps_at_start(self, dt: float) -> str:
         """What a failure in the first steps, of dt [s], may come of, see `jumps`. Collective."""

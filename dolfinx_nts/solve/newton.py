@@ -152,6 +152,7 @@ class StepSolver:
             unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
             if unsolved and (preset := self._presets.alternative(self.snes)) is not None:
                 return self._attempt_otherwise(preset, iterations)
+            # What has run off to infinity fails like that from then on, too.
             unsolved |= reason == PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
         self._tangents.due = True
         failure = self._failure(last, reason, iterations)
@@ -169,7 +170,7 @@ class StepSolver:
             careful: Whether updates are shortened that would turn cells inside out.
             slides: Whether nodes slide in it before they rub.
             again: Whether there was another one before.
-            unsolved: Whether the linear solver failed in that.
+            unsolved: Whether the linear solver failed in that, or it ended at infinity.
         """
         self._upright.begin(careful=careful or self.problem.dives)
         if again:

@@ -449,7 +449,7 @@ def test_a_block_in_a_corner_of_three_planes_rests(friction):
         whole, cut = occ.addBox(0, 0, 0, 0.05, 0.04, 0.06), occ.addBox(0.03, 0.02, 0.05, 1, 1, 1)
         return occ.cut([(3, whole)], [(3, cut)])[0]
 
-    block = of_gmsh(draw, 0.016).rigid(density=1100.0, name="block")
+    block = of_gmsh(draw, 0.02).rigid(density=1100.0, name="block")
     own, gravity = block.surface(everywhere), np.array([-3.0, -2.0, -9.81])
     planes = [nts.Plane((0, 0, 0), normal) for normal in np.eye(3)]
     pairs = [nts.ContactPair(own, plane, friction=friction) for plane in planes]
