@@ -28,6 +28,14 @@ _COMMUNICATORS: list[Any] = [MPI.COMM_SELF, MPI.COMM_WORLD]
 _OPEN: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
 _NUMBERS = itertools.count()
 
+_REASONS: Any = PETSc.SNES.ConvergedReason
+#: SNES's reason where numbers are not finite; PETSc 3.25 gave it another name.
+DIVERGED_NOT_FINITE: int = (
+    _REASONS.DIVERGED_FNORM_NAN
+    if hasattr(_REASONS, "DIVERGED_FNORM_NAN")
+    else _REASONS.DIVERGED_FUNCTION_NANORINF
+)
+
 
 def petsc_communicator(comm: MPI.Comm) -> MPI.Comm:
     """Communicator of the same ranks, one for all meshes, for PETSc's objects.

@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.petsc_compat import DIVERGED_NOT_FINITE
 from dolfinx_nts.solve.accuracy import EXACT, Newton
 from dolfinx_nts.solve.convergence import leaves_work, worst
 from dolfinx_nts.solve.inversion_guard import InversionGuard
@@ -89,7 +90,7 @@ class ConvergenceTest:
             # Here SNES asks for the Jacobian next.
             self._iterates.known.append((x, x.stateGet()))
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
-            return reasons.DIVERGED_FNORM_NAN
+            return DIVERGED_NOT_FINITE
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
         if stalls and not self._measured:
             # An active set that still changes stalls by itself, not by rounding.

@@ -153,7 +153,7 @@ class StepSolver:
             if unsolved and (preset := self._presets.alternative(self.snes)) is not None:
                 return self._attempt_otherwise(preset, iterations)
             # What has run off to infinity fails like that from then on, too.
-            unsolved |= reason == PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
+            unsolved |= reason == petsc_compat.DIVERGED_NOT_FINITE
         self._tangents.due = True
         failure = self._failure(last, reason, iterations)
         if unsolved:
