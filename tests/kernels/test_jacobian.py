@@ -37,8 +37,13 @@ SCENES = [
 ]  # fmt: skip
 
 
-def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0, integration="nodes"):
-    """A small block above a larger one; its lower face is the slave, the other may be smooth."""
+def two_blocks(
+    cell, gap=0.0, speed=0.0, bcs=(), friction=0.0, integration="nodes", *, rigid=False
+):  # fmt: skip
+    """A small block above a larger one, which may be rigid; its lower face is the slave.
+
+    The other's upper face may be smooth.
+    """
     rubber = nts.NeoHookean(1e3, 0.3)
     upper = nts.Continuum(
         box([0.07, 0.12, 1 + gap], [0.87, 0.92, 1.8 + gap], 2, CELLS[cell]),
@@ -48,14 +53,11 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0, integration="node
         velocity=(0, 0, -speed),
         name="upper",
     )
-    lower = nts.Continuum(
-        box([0, 0, 0], [1, 1, 1], 2, CELLS[cell]),
-        rubber,
-        density=1.5,
-        degree=1,
-        name="lower",
-        bcs=bcs,
-    )
+    mesh = box([0, 0, 0], [1, 1, 1], 2, CELLS[cell])
+    lower = (
+        nts.RigidBody(mesh, density=1.5, name="lower") if rigid
+        else nts.Continuum(mesh, rubber, density=1.5, degree=1, name="lower", bcs=bcs)
+    )  # fmt: skip
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
         master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell in SMOOTH),
@@ -101,11 +103,13 @@ class Linearised:
         margin = np.where(on, -1, 1) * rng.uniform(0.2, 0.4, len(gap))
         force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.law.num_constraints))
         force[:, 0] = margin - gap
+        # Constraints of rigid bodies come after those of contacts.
+        here = layout.owned(fields[-1])
         with problem.x as x:
-            x[layout.owned(fields[-1])] = force.ravel()
+            x[here][: force.size] = force.ravel()
         evaluation = problem.evaluate(problem.x)
         assert np.array_equal(evaluation.parts[0].active, on)
-        self.candidates, self.active = len(gap), on
+        self.candidates, self.active, self.forces = len(gap), on, force.size
         self.stick = evaluation.parts[0].stick
         self.solver.assemble(evaluation)
 
@@ -175,6 +179,35 @@ def test_jacobian_of_a_law_after_sums(rule, cell, friction):
     assert at.candidates == 9 and 0 < at.active.sum() < 9
     errors = along_ways(at)
     assert max(errors) < 1e-8, errors
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+@pytest.mark.parametrize(("rule", "friction"), [
+    ("condensed", "mixed"), ("midpoint", "slip"), ("static", "none")
+])  # fmt: skip
+@pytest.mark.parametrize("integration", ["nodes", "surface"])
+@pytest.mark.fast("surface-condensed-mixed")
+def test_jacobian_of_a_rigid_master(rule, friction, integration):
+    """All but the compliance that the matrix lends contacts which may repeat each other."""
+    system = two_blocks(
+        "hex", speed=2.0, friction=FRICTION[friction], integration=integration, rigid=True
+    )
+    at = Linearised(system, rule, "mixed", system.initial_state())
+    assert at.candidates == 9 and 0 < at.active.sum() < 9
+    x, step = at.problem.x.array_r.copy(), 1e-4
+    difference = dense(at.solver.matrix.operator)
+    size = abs(difference).max(axis=1)
+    for j in range(len(x)):
+        for k, weight in STENCIL:
+            other = x.copy()
+            other[j] += k * step
+            difference[:, j] -= weight / step * at.residual(other)
+    contacts = at.blocks()[-1].start + np.arange(at.forces)
+    lent = difference[contacts, contacts]
+    difference[contacts, contacts] = 0.0
+    at.close()
+    assert (abs(difference).max(axis=1) < 1e-8 * size).all()
+    assert (lent <= 1e-8 * size[contacts]).all() and lent.min() < 0.0
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
